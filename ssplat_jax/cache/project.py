@@ -79,7 +79,7 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
         in_sight = rows_in_sight(cache, camera, min_confidence=min_confidence)
         fold = functools.partial(fold_pairs, cache, camera, in_sight, min_confidence=min_confidence)
         start = jnp.full((math.prod(shape),), jnp.inf)
-        nearest = lambda x, pairs, rows, is_row: x.at[pairs.pixels].min(pairs.log_depths, mode="drop")  # noqa: E731
+        nearest = lambda x, pairs, rows, places: x.at[pairs.pixels].min(pairs.log_depths, mode="drop")  # noqa: E731
         fronts = over_shards(jax.lax.pmin, fold(nearest, start))
         weights, offsets = over_shards(jax.lax.psum, _front_sums(fold, window, fronts))
         centers = offsets / jnp.where(weights > 0, weights, 1.0)
@@ -122,7 +122,7 @@ def coarsen(history: ProjectedCache, factor: int) -> ProjectedCache:
 def _front_sums(fold, window, fronts):
     """Pass 2: sums over each pixel's front window: w, and w times log depth relative to its nearest pivot."""
 
-    def visit(sums, pairs: PixelPairs, rows, is_row):
+    def visit(sums, pairs: PixelPairs, rows, places):
         offsets = _offsets_from_front(pairs, fronts)
         weights = jnp.where(offsets <= window, pairs.weights, 0.0)
         return _scatter_add(sums, pairs.pixels, (weights, weights * offsets))
@@ -143,7 +143,7 @@ def _cluster_sums(fold, window, cache, num_views, config, fronts, centers):
             values.append(flat(cache.rgbs)[pivots].reshape(len(pivots), -1, 3).mean(axis=1))
         return jnp.concatenate(values, axis=1)
 
-    def visit(state, pairs: PixelPairs, rows, is_row):
+    def visit(state, pairs: PixelPairs, rows, places):
         scalars, sums = state
         offsets = _offsets_from_front(pairs, fronts)
         weights = jnp.where(jnp.abs(offsets - centers[pairs.pixels]) <= window, pairs.weights, 0.0)
@@ -231,19 +231,20 @@ def fold_pairs(
     cache: VoxelCache,
     camera: Camera,
     in_sight: RowsInSight,
-    visit: Callable[[State, PixelPairs, Int[Array, " n"], Bool[Array, " n"]], State],
+    visit: Callable[[State, PixelPairs, Int[Array, " n"], Int[Array, " n"]], State],
     start: State,
     *,
     min_confidence: float = 0.0,
 ) -> State:
-    """Folds `visit(state, pairs, rows, is_row)` over blocks of the rows in sight.
+    """Folds `visit(state, pairs, rows, places)` over blocks of the rows in sight.
 
     Args:
         cache: holds the pivots.
         camera: a batch of views.
         in_sight: the rows that are visited, of the same cache and views.
-        visit: takes the state, the `v * n * k` pairs of a block of n rows, view-major, the numbers of the rows, and
-            which of them are rows: the last block is filled up with row 0, whose pairs are then not seen.
+        visit: takes the state, the `v * n * k` pairs of a block of n rows, view-major, the numbers of the rows, and the
+            same as targets of a scatter: the last block is filled up with row 0, whose pairs are then not seen, and
+            whose place a scatter drops.
         start: the state before the first block.
         min_confidence: pivots below it are not seen.
     """
@@ -254,7 +255,7 @@ def fold_pairs(
         is_row = i * block + jnp.arange(block, dtype=jnp.int32) < in_sight.number
         means, confidences, counts = (rows_of(x, rows) for x in (cache.means, cache.confidences, cache.counts))
         pairs = _pairs(means, confidences, jnp.where(is_row, counts, 0), camera, min_confidence)
-        return visit(state, pairs, rows, is_row)
+        return visit(state, pairs, rows, jnp.where(is_row, rows, cache.capacity))
 
     return jax.lax.fori_loop(0, (in_sight.number + block - 1) // block, step, start)
 
@@ -262,11 +263,6 @@ def fold_pairs(
 def rows_of(x: Array, rows: Int[Array, " n"]) -> Array:
     """`x[rows]` for row numbers that are valid."""
     return x.at[rows].get(mode="promise_in_bounds")
-
-
-def places_of(rows: Int[Array, " n"], is_row: Bool[Array, " n"], cache: VoxelCache) -> Int[Array, " n"]:
-    """`rows` as targets of a scatter that drops those that are no rows."""
-    return jnp.where(is_row, rows, cache.capacity)
 
 
 def _pairs(means, confidences, counts, camera: Camera, min_confidence: float) -> PixelPairs:

@@ -25,15 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.cache.project import (
-    PixelPairs,
-    RowsInSight,
-    fold_pairs,
-    places_of,
-    project_points,
-    rows_in_sight,
-    rows_of,
-)
+from ssplat_jax.cache.project import PixelPairs, RowsInSight, fold_pairs, project_points, rows_in_sight, rows_of
 from ssplat_jax.cache.state import StoredDepths, Tokens, VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
@@ -106,11 +98,11 @@ def carve(
     fronts = jnp.where(cells.weights > 0, cells.log_depths, -jnp.inf)
     nearest = jax.lax.reduce_window(fronts, jnp.inf, jax.lax.min, (1, 3, 3), (1, 1, 1), "SAME")
 
-    def visit(revised, pairs: PixelPairs, rows, is_row):
+    def visit(revised, pairs: PixelPairs, rows, places):
         before = rows_of(cache.confidences, rows)
         votes = _votes(pairs, cells.weights, cells.log_depths, nearest)
         votes = votes.reshape(len(camera.viewmats), *before.shape).sum(axis=0)
-        return revised.at[places_of(rows, is_row, cache)].set(_revise(before, votes), mode="drop")
+        return revised.at[places].set(_revise(before, votes), mode="drop")
 
     in_sight = in_sight or rows_in_sight(cache, camera)
     return replace(cache, confidences=fold_pairs(cache, camera, in_sight, visit, cache.confidences))
@@ -219,7 +211,7 @@ def observe(
     num_cells, in_sight = cells.weights.size, in_sight or rows_in_sight(cache, camera)
     read = functools.partial(_read_cells, cache, camera, cells)
 
-    def crowd(sums, pairs: PixelPairs, rows, is_row):
+    def crowd(sums, pairs: PixelPairs, rows, places):
         seen = read(pairs, rows)
         on = jnp.where(pairs.weights >= config.memory.min_confidence, seen.on.reshape(-1), 0.0)
         return sums.at[pairs.pixels].add(jnp.stack([on, on * seen.errors.reshape(-1)], axis=-1), mode="drop")
@@ -229,7 +221,7 @@ def observe(
     others = jnp.maximum(others, 1.0)
     table = jnp.stack([jnp.log(others), errors / others], axis=-1)
 
-    def add(observations, pairs: PixelPairs, rows, is_row):
+    def add(observations, pairs: PixelPairs, rows, places):
         seen = read(pairs, rows)
         others = table.at[pairs.pixels].get(mode="fill", fill_value=0.0).reshape(*seen.weights.shape, 2)
         others = kept(others, cache.num_voxels >= 0)
@@ -247,7 +239,7 @@ def observe(
             on * seen.sizes,
         )
         new = jnp.stack([x.sum(axis=0) for x in sums], axis=-1).reshape(len(rows), *observations.shape[1:])
-        return observations.at[places_of(rows, is_row, cache)].add(new, mode="drop")
+        return observations.at[places].add(new, mode="drop")
 
     return replace(cache, observations=fold_pairs(cache, camera, in_sight, add, cache.observations))
 

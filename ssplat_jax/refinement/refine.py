@@ -255,9 +255,8 @@ def tiles_for(gaussians: Gaussians, key_views: KeyViews) -> tuple[int, int]:
 @Kept
 def _num_pairs(gaussians: Gaussians, view: KeyViews) -> Int[Array, "2"]:
     """Tile intersections of a view with fine tiles and with usual ones."""
-    return jnp.stack(
-        [count_pairs(gaussians, view.camera(), compared_views.EFFECTS, tile) for tile in (FINE_TILE, TILE)]
-    )
+    camera, effects = view.camera(), compared_views.EFFECTS
+    return jnp.stack([count_pairs(gaussians, camera, effects, tile) for tile in (FINE_TILE, TILE)])
 
 
 def row_capacity(state: RefineState, key_views: KeyViews, steps: int, config: RefineConfig) -> int:
