@@ -34,15 +34,7 @@ from ssplat_jax.model.decoder import MAX_SCALE, Evidence, apply_evidence, decode
 from ssplat_jax.model.exposure import estimate_exposures
 from ssplat_jax.model.hpda import anchor_depth
 from ssplat_jax.model.network import init_params, network_of
-from ssplat_jax.model.views import (
-    GRID_STRIDE,
-    TokenShapes,
-    Views,
-    back_project,
-    patch_colors,
-    prepare_views,
-    repeat_cells,
-)
+from ssplat_jax.model.views import GRID_STRIDE, Views, back_project, patch_colors, prepare_views, repeat_cells
 
 
 @pytree
@@ -221,7 +213,8 @@ class StreamSplat:
         """Gaussians of the pivots that `take` selects, all rows or those that hold one."""
         rgbs, stored, num_members = take(cache.rgbs), take(cache.footprints), take(cache.num_members)
         footprints = grown_footprints(stored, num_members, self.config)
-        shapes, parts = self._read_shapes(params, take(cache.feats)), divide_cells(rgbs, self.config)
+        shapes = network_of(self.config).read_shapes(params["decoder"], take(cache.feats), self.config)
+        parts = divide_cells(rgbs, self.config)
         if cache.observations is not None:
             num_pivots = jnp.broadcast_to(cache.counts[:, None], cache.confidences.shape)
             evidence = Evidence(
@@ -258,7 +251,7 @@ class StreamSplat:
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
         """Gaussians of tokens that are not in a cache, as training renders them (Sec. 3.7)."""
         gaussians = decode_tokens(
-            self._read_shapes(params, tokens.feats),
+            network_of(self.config).read_shapes(params["decoder"], tokens.feats, self.config),
             means=tokens.means,
             parts=divide_cells(tokens.rgbs, self.config),
             quats=tokens.quats,
@@ -266,9 +259,6 @@ class StreamSplat:
             config=self.config,
         )
         return mask_gaussians(gaussians, self.repeat_per_gaussian(tokens.valid))
-
-    def _read_shapes(self, params: dict, feats: Float[Array, "m c"]) -> TokenShapes:
-        return network_of(self.config).read_shapes(params["decoder"], feats, self.config)
 
     def repeat_per_gaussian(self, mask: Bool[Array, " m"]) -> Bool[Array, " n"]:
         """A mask of tokens or pivots as a mask of their Gaussians."""
