@@ -188,8 +188,9 @@ def _run_steps(
     numbers of `table`, `values` their columns, followed by ones if `with_ones`. Steps go on while, in one of the tiles,
     Gaussians are left and a pixel is above the stop.
     """
+    bounds, end = intersections.bounds, grid.num_tiles
     # Start and end of the pairs of each tile; equal for the padding of `_batches`.
-    first, last = (intersections.bounds[jnp.minimum(tile, grid.num_tiles)] for tile in (tiles, tiles + 1))
+    first, last = bounds[jnp.minimum(tiles, end)], bounds[jnp.minimum(tiles + 1, end)]
     size = schedule.step_size
     has_any = intersections.num_pairs > 0
 
