@@ -95,9 +95,11 @@ def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
         if len(got) != len(wanted) or any(isinstance(w, int) and w != g for w, g in zip(wanted, got, strict=True)):
             sizes = " ".join(map(str, ("t", *of_one) if stacked else of_one))
             raise InputError(f"chunk: {name} must be [{sizes}], got {list(got)}.{fix if wanted else ''}")
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves(chunk)) or not np.any(chunk.valid):
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(chunk)):
         return
     valid, near, far = (np.asarray(x) for x in (chunk.valid, chunk.near, chunk.far))
+    if not valid.any():
+        return
     viewmats, Ks, images = (np.asarray(x)[valid] for x in (chunk.viewmats, chunk.Ks, chunk.images))
     check_matrices(viewmats, Ks, "chunk", complete=True)
     check_images(images, "chunk: images")
