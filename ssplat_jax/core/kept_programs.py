@@ -164,12 +164,9 @@ def _load_or_compile(key: str, jitted: Any, arguments: tuple, dynamic: tuple) ->
     device = jax.devices()[0]
     with contextlib.suppress(Exception):  # whatever a damaged entry raises: the program is compiled
         executable, results = _read(key)
+        trees = jax.tree.structure((dynamic, {})), jax.tree.structure(results)
         return serialize_executable.deserialize_and_load(
-            executable,
-            jax.tree.structure((dynamic, {})),
-            jax.tree.structure(results),
-            backend=device.client,
-            execution_devices=[device],
+            executable, *trees, backend=device.client, execution_devices=[device]
         )
     program = _compiled_anew(jitted.lower(*arguments))
     with contextlib.suppress(Exception):  # a program that JAX cannot serialize, a full disk, a folder that is read-only

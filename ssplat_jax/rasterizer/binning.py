@@ -179,7 +179,9 @@ def intersect_tiles(
     ends = _running_sum(width * height)
 
     def sorted_pairs(capacity: int):
-        rows = _owners(ends, capacity)
+        # The row of each pair: pairs of a row follow each other, and end (exclusively) at `ends`.
+        steps = jnp.zeros((capacity,), jnp.int32).at[ends].add(1, mode="drop")
+        rows = jnp.minimum(jnp.cumsum(steps), num_rows - 1)
         tiles = _tiles(table, images, ends, rows, grid)
         in_pieces = lambda pieces: lambda: _sort_pairs(tiles, rows, grid.num_tiles, num_rows, pieces)  # noqa: E731
         pieces = SORT_PIECES if max_pairs >= MIN_PIECES_CAPACITY else 1
@@ -233,12 +235,6 @@ def _reaches(low, shape, tile: int):
         return jnp.maximum(across - lost, 0.0) ** 2 + (r * dy) ** 2
 
     return jnp.minimum(least(near_x, along_y), least(along_x, near_y)) <= bound * 1.0001 + 1e-4
-
-
-def _owners(ends: Int[Array, " m"], capacity: int) -> Int[Array, " p"]:
-    """The run that each position belongs to, of consecutive runs that end (exclusively) at `ends`."""
-    steps = jnp.zeros((capacity,), jnp.int32).at[ends].add(1, mode="drop")
-    return jnp.minimum(jnp.cumsum(steps), ends.shape[0] - 1)
 
 
 def _sort_pairs(
