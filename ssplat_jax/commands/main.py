@@ -21,9 +21,9 @@ from ssplat_jax import __version__
 from ssplat_jax.commands.measure_commands import Bench, Experiment
 from ssplat_jax.commands.program_cache import keep_no_programs, keep_programs
 from ssplat_jax.commands.scene_commands import Export, Inspect, Poses, Render, View
-from ssplat_jax.commands.stream_commands import Demo, Eval, Refine, Run
 from ssplat_jax.commands.weights_commands import ImportWeights, Train, Weights
 from ssplat_jax.core.errors import CacheError, InputError
+from ssplat_jax.runs.stream_commands import Demo, Eval, Refine, Run
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
 

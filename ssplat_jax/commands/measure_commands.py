@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.runs.options import QuietOption
+from ssplat_jax.runs.stream_commands import QuietOption
 
 
 @dataclasses.dataclass(frozen=True)

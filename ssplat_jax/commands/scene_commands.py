@@ -10,7 +10,7 @@ import tyro
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError, require_positive
-from ssplat_jax.runs.options import AxesOption, OfCapture, PosesOption, QuietOption, RenderOptions
+from ssplat_jax.runs.stream_commands import AxesOption, OfCapture, PosesOption, QuietOption
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,24 +148,6 @@ class Export:
         print(f"wrote {self.to}: {report.num_written} Gaussians{f' ({words})' if words else ''}")
         if views is not None and (difference := difference_in_words(self.to, views, turn)):
             print(difference)
-        return 0
-
-
-@dataclasses.dataclass(frozen=True)
-class Render(RenderOptions):
-    """Render a scene from the cameras of a capture, one picture each.
-
-    Example: ssplat render runs/kitchen path/to/capture --stride 10 --out runs/pictures
-    """
-
-    def run(self) -> int:
-        from ssplat_jax.core.console import Reporter
-        from ssplat_jax.runs.scene_outputs import render_run
-        from ssplat_jax.storage.run_folder import RunFolder
-
-        num_pictures = render_run(self, Reporter(self.quiet))
-        film_name = f", {RunFolder(self.out).film.name}" if self.film else ""
-        print(f"wrote {num_pictures} pictures to {self.out}/views{film_name}")
         return 0
 
 

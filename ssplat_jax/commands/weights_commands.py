@@ -8,7 +8,7 @@ import tyro
 
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.errors import InputError, echo, refusal, require_count, require_positive
-from ssplat_jax.runs.options import ConfigChanges, QuietOption, apply_changes, stopped
+from ssplat_jax.runs.stream_commands import ConfigChanges, QuietOption, apply_changes, stopped
 
 if TYPE_CHECKING:
     from ssplat_jax.core.console import Reporter

@@ -18,8 +18,8 @@ from ssplat_jax.data.readers.transforms_json import num_listed
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import check_look_ahead
 from ssplat_jax.runs.open_run import OpenRun, open_run
-from ssplat_jax.runs.options import RunOptions
 from ssplat_jax.runs.run_results import finish_run, finished_scene
+from ssplat_jax.runs.stream_commands import Run
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder
 from ssplat_jax.storage.saved_states import load_newest_state
@@ -43,7 +43,7 @@ class RunResult:
     was_finished: bool = False  # the folder held it already; nothing was streamed or written
 
 
-def run_capture(model: StreamSplat, params: dict, options: RunOptions, reporter: Reporter) -> RunResult:
+def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Reporter) -> RunResult:
     """Streams a capture into a folder, continuing the run that the folder holds.
 
     Every image is decoded once, when its chunk is due. A damaged one stops the stream there, with what came before it
@@ -87,9 +87,7 @@ def run_capture(model: StreamSplat, params: dict, options: RunOptions, reporter:
         return RunResult(run.num_views, finish_run(run, options.path, reporter).num_written)
 
 
-def _stream(
-    run: OpenRun, source: "WholeCapture | GrowingCapture", options: RunOptions, reporter: Reporter
-) -> int | None:
+def _stream(run: OpenRun, source: "WholeCapture | GrowingCapture", options: Run, reporter: Reporter) -> int | None:
     """Streams the views that the run has not had yet; returns the signal that stopped it, if one did."""
     deltas = DeltaWriter(run, is_wanted=options.deltas or options.view)
     with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", source.total) as advance:
@@ -119,7 +117,7 @@ def _stream(
 class WholeCapture:
     """The frames of a capture that is complete."""
 
-    def __init__(self, options: RunOptions) -> None:
+    def __init__(self, options: Run) -> None:
         capture = open_capture(options.path, size=options.image_size)
         if options.scale != 1.0:
             # Opened anew, as `refine` and `export` will: a procedural capture renders other images for another size.
@@ -143,7 +141,7 @@ class GrowingCapture:
     `done`, or once for some seconds no frame has been listed and none has become complete.
     """
 
-    def __init__(self, options: RunOptions, reporter: Reporter) -> None:
+    def __init__(self, options: Run, reporter: Reporter) -> None:
         self._path, self._options, self._reporter = without_tilde(options.path), options, reporter
         self._opened: Capture | None = None
         self._most_listed = 0  # frames that the listing has had, complete or not

@@ -17,8 +17,8 @@ from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import evaluate
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
-from ssplat_jax.runs.options import EvalOptions
 from ssplat_jax.runs.run_results import report_eval
+from ssplat_jax.runs.stream_commands import Eval
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
@@ -27,7 +27,7 @@ SCORES = ("literal", "shown")
 """Scores of a scene that are averaged over scenes."""
 
 
-def evaluate_run(model: StreamSplat, params: dict, options: EvalOptions, reporter: Reporter) -> dict[str, Any]:
+def evaluate_run(model: StreamSplat, params: dict, options: Eval, reporter: Reporter) -> dict[str, Any]:
     """Scores a capture, or every scene of an index file below a folder.
 
     Args:
@@ -97,12 +97,12 @@ def evaluate_run(model: StreamSplat, params: dict, options: EvalOptions, reporte
     return metrics
 
 
-def _split(capture: Capture, options: EvalOptions) -> Split:
+def _split(capture: Capture, options: Eval) -> Split:
     """The frames of a capture by the protocol."""
     return choose_split(options.protocol, len(capture), options.stride, options.context, options.targets)
 
 
-def _read_index(options: EvalOptions) -> tuple[Index, tuple[str, ...]]:
+def _read_index(options: Eval) -> tuple[Index, tuple[str, ...]]:
     """The index file of the options, which choose frames in no other way, and notes for the user."""
     assert options.index is not None
     chosen = {name: getattr(options, name) for name in ("stride", "context", "targets")}
@@ -112,7 +112,7 @@ def _read_index(options: EvalOptions) -> tuple[Index, tuple[str, ...]]:
     return read_index(options.index)
 
 
-def index_of_folder(options: EvalOptions) -> tuple[Index, tuple[str, ...]]:
+def index_of_folder(options: Eval) -> tuple[Index, tuple[str, ...]]:
     """The frames of every capture in a folder by the protocol, None for one that is too short, and notes that say so.
 
     Raises:

@@ -14,8 +14,8 @@ from ssplat_jax.evaluation.scoring import mean_scores, score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, key_views_of
 from ssplat_jax.runs.open_run import load_run
-from ssplat_jax.runs.options import RefineOptions
 from ssplat_jax.runs.run_results import picture_views, report_run, save_scene, shown_frames
+from ssplat_jax.runs.stream_commands import Refine
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder, lock_folder
 from ssplat_jax.storage.saved_states import check_same
@@ -36,7 +36,7 @@ class RefineResult:
     interrupted: int | None = None  # the signal that stopped it, if one did
 
 
-def refine_run(params: dict, options: RefineOptions, reporter: Reporter) -> RefineResult:
+def refine_run(params: dict, options: Refine, reporter: Reporter) -> RefineResult:
     """Writes `refined.ply` beside the scene of a run, continuing a refinement that stopped. `scene.ply` stays.
 
     The pictures and the report of the run become those of the refined scene. An interrupted refinement writes the scene

@@ -29,8 +29,8 @@ from ssplat_jax.evaluation.pictures import VideoWriter, save_image
 from ssplat_jax.rasterizer import Effects, effects_for, fill_holes, render
 from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.runs.open_run import load_run, open_capture_of_scene
-from ssplat_jax.runs.options import RenderOptions
 from ssplat_jax.runs.run_results import scene_to_show
+from ssplat_jax.runs.stream_commands import Render
 from ssplat_jax.scene_files.formats import SCENE_READERS, ExportReport, file_axes, load_scene, save_gaussians
 from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
@@ -180,7 +180,7 @@ def difference_in_words(to: Path, views: KnownCameras, turn: Float64[np.ndarray,
     )
 
 
-def render_run(options: RenderOptions, reporter: Reporter) -> int:
+def render_run(options: Render, reporter: Reporter) -> int:
     """Writes views/<frame>.png for frames of a capture, and optionally film.mp4; returns the number of pictures.
 
     The scene is drawn with the filter that its file names, at the exposure of its file: the middle one of its stream.

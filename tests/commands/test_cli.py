@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from ssplat_jax.commands.main import COMMANDS
-from ssplat_jax.commands.stream_commands import Run
 from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.runs.options import apply_changes
+from ssplat_jax.runs.stream_commands import Run, apply_changes
 from ssplat_jax.scene_files.formats import load_ply, save_ply
 from ssplat_jax.storage.weights import as_published, load_weights, published_tensors
 from tests.commands.command_fixture import edit, make_capture, run

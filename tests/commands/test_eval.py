@@ -11,7 +11,7 @@ from ssplat_jax.data.split import choose_split, index_to_json, read_index
 from ssplat_jax.evaluation import cost
 from ssplat_jax.runs import evaluate_run
 from ssplat_jax.runs.evaluate_run import index_of_folder
-from ssplat_jax.runs.options import EvalOptions
+from ssplat_jax.runs.stream_commands import Eval
 from tests.commands.command_fixture import SIZE, make_capture, read, run
 from tests.streaming.narrow_model import FEW_GAUSSIANS
 
@@ -71,7 +71,7 @@ def test_a_folder_of_scenes_without_an_index_gets_one_by_the_protocol(tmp_path):
     for name, num_frames in (("a", 12), ("b", 9), ("c", 5)):
         make_capture(tmp_path / "scenes" / name, num_frames=num_frames, size=SIZE)
     (tmp_path / "scenes" / "notes").mkdir()
-    options = EvalOptions(str(tmp_path / "scenes"), tmp_path / "out", protocol="paper", context=6, targets=3)
+    options = Eval(str(tmp_path / "scenes"), tmp_path / "out", protocol="paper", context=6, targets=3)
     index, (note,) = index_of_folder(options)
     assert list(index) == ["a", "b", "c"] and index["c"] is None and note.startswith("c: left out (")
     for name, num_frames in (("a", 12), ("b", 9)):

@@ -11,7 +11,7 @@ import pytest
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.runs import capture_run
 from ssplat_jax.runs.capture_run import GrowingCapture
-from ssplat_jax.runs.options import RunOptions
+from ssplat_jax.runs.stream_commands import Run
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.command_fixture import SIZE, edit, make_capture, read, run
@@ -65,7 +65,7 @@ def test_a_growing_folder_gives_the_scene_of_the_whole_one(tmp_path, narrow):
 
 
 def growing_capture(path, **options):
-    return GrowingCapture(RunOptions(str(path), path, quiet_seconds=1.0, **options), Reporter())
+    return GrowingCapture(Run(str(path), path, quiet_seconds=1.0, **options), Reporter())
 
 
 @pytest.mark.parametrize(("stride", "comes"), [(8, "the listing"), (1, "the listing"), (8, "the images")])

@@ -23,7 +23,7 @@ from ssplat_jax.rasterizer import fill_holes
 from ssplat_jax.refinement.compared_views import RefineConfig, view_loss
 from ssplat_jax.refinement.refine import key_views_of
 from ssplat_jax.runs.capture_run import GrowingCapture
-from ssplat_jax.runs.options import RunOptions
+from ssplat_jax.runs.stream_commands import Run
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 from ssplat_jax.streaming.session import Session
 from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, another, frame, make_capture, opened, top
@@ -111,7 +111,7 @@ def test_a_mask_of_another_shape_is_refused(tmp_path):
 def test_a_frame_waits_until_its_mask_is_complete(tmp_path):
     """As `ssplat run --watch` takes frames: a mask of which half is written is as an image of which half is."""
     root = make_capture(tmp_path / "c", by_path)
-    watched = GrowingCapture(RunOptions(str(root), tmp_path / "out", quiet_seconds=60.0), Reporter())
+    watched = GrowingCapture(Run(str(root), tmp_path / "out", quiet_seconds=60.0), Reporter())
     whole = (root / "hidden" / "a.png").read_bytes()
     for content, num_frames in ((None, 2), (whole[: len(whole) // 2], 2), (whole, NUM_FRAMES)):
         (root / "hidden" / "a.png").unlink(missing_ok=True)

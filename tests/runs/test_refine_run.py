@@ -11,8 +11,8 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs import refine_run as module
 from ssplat_jax.runs.capture_run import run_capture
-from ssplat_jax.runs.options import RefineOptions, RunOptions
 from ssplat_jax.runs.refine_run import refine_run
+from ssplat_jax.runs.stream_commands import Refine, Run
 from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.model.small import random_params
@@ -22,13 +22,13 @@ CAPTURE, QUIET = "procedural:room?frames=4&size=64x48", Reporter(quiet=True)
 
 
 def refine(path, steps=4, overwrite=False):
-    options = RefineOptions(path, CAPTURE, steps=steps, save_every=2, overwrite=overwrite)
+    options = Refine(path, CAPTURE, steps=steps, save_every=2, overwrite=overwrite)
     return refine_run(params(), options, QUIET)
 
 
 def stream(out, overwrite=False):
     """Streams small frames into `out`."""
-    options = RunOptions(CAPTURE, out, save_every=1, overwrite=overwrite)
+    options = Run(CAPTURE, out, save_every=1, overwrite=overwrite)
     return run_capture(StreamSplat(FEW_GAUSSIANS), params(), options, QUIET)
 
 
