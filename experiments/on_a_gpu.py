@@ -33,8 +33,7 @@ from ssplat_jax.rasterizer.render import render, round_up
 from ssplat_jax.refinement import RefineConfig, refine
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
-from ssplat_jax.streaming.feed import feed_capture
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Session, feed_capture
 
 Runs = dict[str, Callable[[], Any]]
 Row = dict[str, Any]

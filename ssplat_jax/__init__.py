@@ -44,44 +44,33 @@ if TYPE_CHECKING:
     from ssplat_jax.storage.weights import load_params as load_params
     from ssplat_jax.streaming.session import Session as Session
 
-# Public name -> module that defines it.
+# Modules that define public names.
 _MODULES = {
-    "CacheError": "core.errors",
-    "Camera": "core.cameras",
-    "Chunk": "core.chunk",
-    "Effects": "rasterizer",
-    "Gaussians": "core.gaussians",
-    "InputError": "core.errors",
-    "RenderOutput": "rasterizer",
-    "Session": "streaming.session",
-    "StorageError": "core.errors",
-    "StreamConfig": "config",
-    "StreamFrame": "data.stream_frame",
-    "StreamSplat": "model.streamsplat",
-    "VoxelCache": "cache.state",
-    "adjust_poses": "poses.adjust_poses",
-    "check_cache": "cache.state",
-    "ensure_capacity": "cache.state",
-    "fill_holes": "rasterizer",
-    "load_params": "storage.weights",
-    "load_ply": "scene_files.formats",
-    "load_scene": "scene_files.formats",
-    "online_refinement": "refinement",
-    "open_capture": "data.open_capture",
-    "preset": "config",
-    "refine": "refinement",
-    "render": "rasterizer",
-    "save_ply": "scene_files.formats",
-    "save_spz": "scene_files.formats",
+    "cache.state": ("VoxelCache", "check_cache", "ensure_capacity"),
+    "config": ("StreamConfig", "preset"),
+    "core.cameras": ("Camera",),
+    "core.chunk": ("Chunk",),
+    "core.errors": ("CacheError", "InputError", "StorageError"),
+    "core.gaussians": ("Gaussians",),
+    "data.open_capture": ("open_capture",),
+    "data.stream_frame": ("StreamFrame",),
+    "model.streamsplat": ("StreamSplat",),
+    "poses.adjust_poses": ("adjust_poses",),
+    "rasterizer": ("Effects", "RenderOutput", "fill_holes", "render"),
+    "refinement": ("online_refinement", "refine"),
+    "scene_files.formats": ("load_ply", "load_scene", "save_ply", "save_spz"),
+    "storage.weights": ("load_params",),
+    "streaming.session": ("Session",),
 }
+_HOMES = {name: module for module, names in _MODULES.items() for name in names}
 __version__ = "0.1.0"
-__all__ = sorted(_MODULES)
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str):
-    if name not in _MODULES:
+    if name not in _HOMES:
         raise AttributeError(f"module 'ssplat_jax' has no attribute {name!r}")
-    module = importlib.import_module(f"ssplat_jax.{_MODULES[name]}")
+    module = importlib.import_module(f"ssplat_jax.{_HOMES[name]}")
     globals()[name] = value = getattr(module, name)
     return value
 

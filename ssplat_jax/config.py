@@ -295,22 +295,3 @@ def preset(name: str) -> StreamConfig:
     if name not in PRESETS:
         raise InputError(f"no preset {name!r}; there is {', '.join(sorted(PRESETS))}.")
     return PRESETS[name]
-
-
-@dataclasses.dataclass(frozen=True)
-class Quality:
-    """A trade-off between accuracy and time (`ssplat experiment accuracy_vs_time`, docs/results.md)."""
-
-    scale: float
-    """Factor by which images are resized before they are streamed."""
-    refine_steps: int = 0
-    """Refinement steps on the streamed views after the stream."""
-
-
-QUALITIES: dict[str, Quality] = {
-    "fast": Quality(0.5),
-    "balanced": Quality(0.75),
-    "accurate": Quality(1.0),
-    "best": Quality(1.0, refine_steps=100),
-}
-"""Choices of `--quality`."""

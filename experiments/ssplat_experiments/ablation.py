@@ -31,8 +31,7 @@ from ssplat_jax.evaluation.scoring import score_targets, score_view
 from ssplat_jax.model.network import complete_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.weights import load_params
-from ssplat_jax.streaming.feed import feed_capture
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Session, feed_capture
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.loop import train
 from ssplat_jax.training.losses import RenderingLoss

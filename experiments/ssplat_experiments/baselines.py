@@ -21,7 +21,7 @@ from ssplat_jax.evaluation.cost import abstract, added_bytes, live_bytes, memory
 from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import ImageScore, exposure_for, nearest_views, score_image
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.streaming.feed import Exposures
+from ssplat_jax.streaming.session import Exposures
 
 BASELINES = ("copy nearest", "mean color", "warp nearest")
 

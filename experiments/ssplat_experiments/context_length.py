@@ -30,7 +30,7 @@ from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import ImageScore, mean_images, score_view
 from ssplat_jax.storage.weights import load_params
-from ssplat_jax.streaming.feed import Exposures, feed_capture
+from ssplat_jax.streaming.session import Exposures, feed_capture
 
 OURS, APPEND, JOINT = "ours", "append-all", "joint"
 NUM_TARGETS = 16

@@ -29,8 +29,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.model.views import prepare_views
 from ssplat_jax.rasterizer import render
-from ssplat_jax.streaming.feed import feed_capture
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Session, feed_capture
 
 STAGES = ("copy to device", "project the cache", "network", "fuse and vote", "decode", "render")
 WHOLE = "as a stream runs it"

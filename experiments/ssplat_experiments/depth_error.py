@@ -27,8 +27,7 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
-from ssplat_jax.streaming.feed import feed_chunks
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Session, feed_chunks
 
 SIZE = (320, 240)
 CONTEXT = {"cpu": 64, "smoke": 8}

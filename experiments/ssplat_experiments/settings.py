@@ -14,7 +14,7 @@ from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, key_views_of
-from ssplat_jax.streaming.feed import Exposures, feed_capture
+from ssplat_jax.streaming.session import Exposures, feed_capture
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""The `ssplat` command line: one file per command."""
+"""The `ssplat` command line: its entry point, and the commands that stream nothing."""

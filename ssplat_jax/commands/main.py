@@ -11,6 +11,7 @@ import operator
 import os
 import platform
 import sys
+import traceback
 from collections.abc import Callable
 from importlib import metadata
 from typing import Annotated
@@ -20,10 +21,10 @@ import tyro
 from ssplat_jax import __version__
 from ssplat_jax.commands.measure_commands import Bench, Experiment
 from ssplat_jax.commands.program_cache import keep_no_programs, keep_programs
-from ssplat_jax.commands.scene_commands import Export, Inspect, Poses, Render, View
+from ssplat_jax.commands.scene_commands import Export, Inspect, Poses, View
 from ssplat_jax.commands.weights_commands import ImportWeights, Train, Weights
 from ssplat_jax.core.errors import CacheError, InputError
-from ssplat_jax.runs.stream_commands import Demo, Eval, Refine, Run
+from ssplat_jax.runs.stream_commands import Demo, Eval, Refine, Render, Run
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
 
@@ -125,19 +126,11 @@ def guarded(run: Callable[[], int]) -> int:
         if "RESOURCE_EXHAUSTED" in str(error):
             return _refuse("out of device memory; try a smaller --size or capacity.", EXIT_MEMORY)
         given = next((f"{name}={os.environ[name]}" for name in PLATFORMS if os.environ.get(name)), None)
-        if given and _is_in_backends(error):
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        if given and frame.f_globals.get("__name__", "").endswith(".xla_bridge"):  # JAX was opening its devices
             fix = "for `cuda`, pip install -e '.[cuda]'; or unset it"
             return _refuse(f"{given}: wanted a platform that JAX has here, got none; {fix}.", EXIT_INPUT)
         raise
-
-
-def _is_in_backends(error: BaseException) -> bool:
-    """True if the error was raised while JAX opened its devices."""
-    frame, names = error.__traceback__, []
-    while frame is not None:
-        names.append(frame.tb_frame.f_globals.get("__name__", ""))
-        frame = frame.tb_next
-    return names[-1].endswith(".xla_bridge")
 
 
 def _refuse(message: object, code: int) -> int:

@@ -16,6 +16,8 @@ import warnings
 from collections.abc import MutableMapping
 from pathlib import Path
 
+import platformdirs
+
 SWITCH = "SSPLAT_PROGRAM_CACHE"
 """Environment variable: `off`, or a folder in place of the user's cache folder."""
 
@@ -39,7 +41,8 @@ def keep_programs(environment: MutableMapping[str, str] = os.environ) -> None:
         return
     if FOLDER not in environment:
         try:
-            folder = Path(environment.get(SWITCH) or _users_cache()) / "programs" / _machine()
+            users = environment.get(SWITCH) or platformdirs.user_cache_path("ssplat")
+            folder = Path(users) / "programs" / _machine()
             folder.mkdir(parents=True, exist_ok=True)
         except (OSError, RuntimeError):  # a home that cannot be written, or none: every command compiles
             return
@@ -75,13 +78,6 @@ def replace_damaged(folder: Path) -> None:
 def num_cores() -> int:
     """As `core.cpu_backend.num_cores`, which imports JAX: it would read its variables before they are set here."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _users_cache() -> Path:
-    """The package's folder among the user's caches."""
-    from platformdirs import user_cache_path
-
-    return user_cache_path("ssplat")
 
 
 def _machine() -> str:

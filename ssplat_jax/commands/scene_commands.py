@@ -1,4 +1,4 @@
-"""The commands around a stream: `ssplat poses` and `inspect` before it, `export`, `render` and `view` after it."""
+"""The commands around a stream: `ssplat poses` and `inspect` before it, `export` and `view` after it."""
 
 import dataclasses
 import shlex
@@ -11,6 +11,7 @@ import tyro
 from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError, require_positive
 from ssplat_jax.runs.stream_commands import AxesOption, OfCapture, PosesOption, QuietOption
+from ssplat_jax.storage.run_folder import RunFolder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +122,6 @@ class Export:
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.scene_outputs import decoded_scene, difference_in_words, export_scene, views_of
         from ssplat_jax.scene_files.formats import check_format, load_scene
-        from ssplat_jax.storage.run_folder import RunFolder
         from ssplat_jax.storage.weights import load_params
 
         check_format(self.to)
@@ -174,12 +174,7 @@ class View:
 
         require_positive(port=self.port, most=self.most)
         reporter = Reporter(quiet=False)
-        ended = view_scene(
-            open_source(self.scene),
-            host=self.host,
-            port=self.port,
-            max_gaussians=self.most,
-            reporter=reporter,
-        )
+        source = open_source(self.scene)
+        ended = view_scene(source, host=self.host, port=self.port, max_gaussians=self.most, reporter=reporter)
         print("closed the viewer", file=sys.stderr)
         return 128 + ended

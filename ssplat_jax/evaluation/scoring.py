@@ -32,8 +32,7 @@ from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder, make_writable
-from ssplat_jax.streaming.feed import Exposures, begin_stream, feed_capture, middle_exposure
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Exposures, Session, begin_stream, feed_capture, middle_exposure
 
 NUM_AVERAGED = 3  # streamed frames whose exposures are averaged for a novel view
 

@@ -37,7 +37,7 @@ from ssplat_jax.refinement.refine_step import (
     seen_rows,
     without_padding,
 )
-from ssplat_jax.streaming.feed import Exposures
+from ssplat_jax.streaming.session import Exposures
 
 Images = Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w 3"]
 

@@ -23,8 +23,8 @@ from ssplat_jax.runs.stream_commands import Run
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder
 from ssplat_jax.storage.saved_states import load_newest_state
-from ssplat_jax.streaming.feed import FedChunk, feed_chunks, middle_exposure
 from ssplat_jax.streaming.scene_delta import SceneFeed
+from ssplat_jax.streaming.session import FedChunk, feed_chunks, middle_exposure
 
 LARGE = 640 * 480
 """Pixels of an image above which a run says that smaller ones take less time."""

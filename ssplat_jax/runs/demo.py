@@ -17,8 +17,7 @@ from ssplat_jax.runs.run_results import save_scene
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder, make_writable
 from ssplat_jax.storage.weights import load_params
-from ssplat_jax.streaming.feed import Exposures, feed_chunks
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Exposures, Session, feed_chunks
 
 SHOWN_PIVOTS = 1 << 16
 """Pivots that are decoded after every stage, as many as after the last: every number is a program to compile."""

@@ -34,8 +34,7 @@ from ssplat_jax.storage.files import load_arrays, save_arrays
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
 from ssplat_jax.storage.saved_states import check_same, load_newest_state, restore_previous, save_state
 from ssplat_jax.storage.weights import params_digest
-from ssplat_jax.streaming.feed import Exposures, FedChunk, begin_stream
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Exposures, FedChunk, Session, begin_stream
 
 
 @dataclasses.dataclass

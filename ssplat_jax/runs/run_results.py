@@ -25,7 +25,7 @@ from ssplat_jax.storage.chunk_records import ChunkRecord, load_chunk_records
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params, params_digest
-from ssplat_jax.streaming.feed import Exposures, middle_exposure
+from ssplat_jax.streaming.session import Exposures, middle_exposure
 
 _jitted_scale_colors = Kept(scale_colors)
 

@@ -34,7 +34,7 @@ from ssplat_jax.runs.stream_commands import Render
 from ssplat_jax.scene_files.formats import SCENE_READERS, ExportReport, file_axes, load_scene, save_gaussians
 from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
-from ssplat_jax.streaming.feed import middle_exposure
+from ssplat_jax.streaming.session import middle_exposure
 
 Pose = Float64[np.ndarray, "4 4"]
 Intrinsics = Float64[np.ndarray, "3 3"]

@@ -13,9 +13,13 @@ from typing import Annotated, Literal, get_args, get_type_hints
 
 import tyro
 
-from ssplat_jax.config import PRESETS, QUALITIES, StreamConfig, preset
+from ssplat_jax.config import PRESETS, StreamConfig, preset
 from ssplat_jax.core.errors import InputError, require_count
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
+
+QUALITIES = {"fast": (0.5, 0), "balanced": (0.75, 0), "accurate": (1.0, 0), "best": (1.0, 100)}
+"""By `--quality`: the factor by which images are resized before they are streamed, and refinement steps afterwards
+(`ssplat experiment accuracy_vs_time`, docs/results.md)."""
 
 CapturePath = Annotated[
     str,
@@ -158,12 +162,12 @@ class StreamOptions(OfCapture):
     @property
     def scale(self) -> float:
         """Size of the streamed images relative to `size`."""
-        return QUALITIES[self.quality].scale
+        return QUALITIES[self.quality][0]
 
     @property
     def refine_steps(self) -> int:
         """Refinement steps after the stream: those asked for with --refine, else those of --quality."""
-        return QUALITIES[self.quality].refine_steps if self.refine is None else self.refine
+        return QUALITIES[self.quality][1] if self.refine is None else self.refine
 
     def load_model(self, *, causal: bool):
         """(model, params) of a preset's shipped weights or of a weights file, with the changes that options ask for.

@@ -34,8 +34,7 @@ from ssplat_jax.refinement import online_refinement
 from ssplat_jax.refinement.compared_views import EFFECTS
 from ssplat_jax.refinement.refine import key_views_of
 from ssplat_jax.refinement.refine_step import may_be_seen, round_rows
-from ssplat_jax.streaming.feed import feed_capture
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Session, feed_capture
 from ssplat_jax.training.samples import CaptureMix, TrainingStart
 
 PAIRS_COUNTED = 12  # crops of each scene whose tile intersections are counted, for the capacity of all

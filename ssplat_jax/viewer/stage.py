@@ -283,15 +283,10 @@ class Stage:
             self._packed = (scene, visible_splats(scene, self.unit, self._max_gaussians))
         return self._packed[1]
 
-    @property
-    def offset(self) -> Float64[np.ndarray, "3"]:
-        """Offset of the scene's positions, in the capture's frame."""
-        return np.zeros(3) if self.scene is None else np.asarray(self.scene.offset)
-
     def to_browser(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
         """A pose of the capture in the browser's units."""
-        pose = camtoworld.copy()
-        pose[:3, 3] = (pose[:3, 3] - self.offset) / self.distance
+        pose, offset = camtoworld.copy(), (0.0, 0.0, 0.0) if self.scene is None else self.scene.offset
+        pose[:3, 3] = (pose[:3, 3] - offset) / self.distance
         return pose
 
 

@@ -24,8 +24,7 @@ from ssplat_jax.refinement.compared_views import RefineConfig, view_loss
 from ssplat_jax.refinement.refine import key_views_of
 from ssplat_jax.runs.capture_run import GrowingCapture
 from ssplat_jax.runs.stream_commands import Run
-from ssplat_jax.streaming.feed import Exposures, feed_capture
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Exposures, Session, feed_capture
 from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, another, frame, make_capture, opened, top
 from tests.data.capture_fixture import smooth_capture
 from tests.scene_files.scene_fixture import scene

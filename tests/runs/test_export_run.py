@@ -18,7 +18,7 @@ from ssplat_jax.runs.run_results import scene_to_show
 from ssplat_jax.runs.scene_outputs import KnownCameras, difference_in_words, export_scene, turned
 from ssplat_jax.scene_files.formats import file_axes, save_ply
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.streaming.feed import middle_exposure
+from ssplat_jax.streaming.session import middle_exposure
 from tests.commands.command_fixture import run
 from tests.rasterizer.scenes import balls
 from tests.scene_files.scene_fixture import camera, scene

@@ -21,8 +21,7 @@ from ssplat_jax.core.numerics import safe_sqrt
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.procedural import procedural_views
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.streaming.feed import feed_capture
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Session, feed_capture
 from tests.cache.streams import CONFIG, Recipe, to_jax
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits

@@ -14,9 +14,8 @@ from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.refinement import online_refinement
-from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.live_views import STEP, widen_range
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Session, feed_chunks
 from tests.model.small import random_params
 from tests.streaming.narrow_model import FEW_GAUSSIANS, assert_same_bits
 

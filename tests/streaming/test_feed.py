@@ -7,8 +7,7 @@ import pytest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
-from ssplat_jax.streaming.feed import feed_capture, feed_chunks
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import Session, feed_capture, feed_chunks
 
 
 class CountingSession(Session):
