@@ -84,7 +84,7 @@ def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Report
             run.folder.clear_refinement()  # of a scene of fewer views
         elif (num_written := finished_scene(run.folder, run.num_views)) is not None:
             return RunResult(run.num_views, num_written, was_finished=True)
-        return RunResult(run.num_views, finish_run(run, options.path, reporter).num_written)
+        return RunResult(run.num_views, finish_run(run, options.path, reporter))
 
 
 def _stream(run: OpenRun, source: "WholeCapture | GrowingCapture", options: Run, reporter: Reporter) -> int | None:

@@ -15,7 +15,7 @@ from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs.run_results import save_scene
 from ssplat_jax.storage.files import write_json
-from ssplat_jax.storage.run_folder import RunFolder, make_writable
+from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Exposures, Session, feed_chunks
 
@@ -39,11 +39,10 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
 
     Raises:
         InputError: `out` holds a run.
-        StorageError: `out` cannot be written.
+        StorageError: `out` cannot be written; who calls it has locked it, see `lock_folder`.
     """
     folder, since = RunFolder(out), time.perf_counter()
     folder.check_no_run()
-    make_writable(out)  # before the long part
     folder.clear_refinement()  # of an earlier command
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     session = Session(model, params)

@@ -12,7 +12,7 @@ are the commands that come after it, because their results would mix two scenes.
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -214,7 +214,8 @@ class SavedRun:
             StorageError: the run's adjusted poses are damaged.
         """
         capture = open_capture(path, size=tuple(self.header["size"]))
-        capture = dataclasses.replace(with_poses_of_run(capture, self.folder), streams_depth=self.header["depth"])
+        capture = with_poses_of_run(capture, self.folder) or capture
+        capture = dataclasses.replace(capture, streams_depth=self.header["depth"])
         frames, streamed = self.header["frames"], list(map(int, self.header["images"]))
         is_same = max(frames) < len(capture) and capture.digest(frames) == self.header["poses"]
         if not is_same or _image_digests(capture, streamed) != self.header["images"]:
@@ -250,39 +251,40 @@ def _image_digests(capture: Capture, frames) -> dict[str, str]:
 POSES_KIND = "adjusted poses 1"
 
 
-@dataclasses.dataclass(frozen=True)
-class SavedPoses:
-    """The adjusted poses that a run keeps, and what they were adjusted from."""
-
-    capture: str  # digest of the streamed frames with the poses as given
-    camtoworlds: dict[int, Float64[np.ndarray, "4 4"]]  # of these frames
-
-    def of(self, capture: Capture) -> Capture | None:
-        """The capture with these poses; None if they belong to another capture."""
-        if max(self.camtoworlds) >= len(capture) or capture.digest(list(self.camtoworlds)) != self.capture:
-            return None
-        frames = [
-            dataclasses.replace(frame, camtoworld=self.camtoworlds[i]) if i in self.camtoworlds else frame
-            for i, frame in enumerate(capture.frames)
-        ]
-        return dataclasses.replace(capture, frames=tuple(frames))
-
-    def save(self, folder: RunFolder) -> None:
-        """Writes the poses to the folder of the run."""
-        arrays = {str(i): pose for i, pose in self.camtoworlds.items()}
-        save_arrays(folder.adjusted_poses, arrays, POSES_KIND, {"capture": self.capture})
+Poses = dict[int, Float64[np.ndarray, "4 4"]]
+"""Adjusted poses by frame."""
 
 
-def load_poses(folder: RunFolder) -> SavedPoses | None:
-    """The poses that `folder` keeps, or None.
+def save_poses(folder: RunFolder, given: str, poses: Poses) -> None:
+    """Writes adjusted poses to the folder of a run; `given` is the digest of these frames with the poses as given."""
+    save_arrays(folder.adjusted_poses, {str(i): pose for i, pose in poses.items()}, POSES_KIND, {"capture": given})
+
+
+def load_poses(folder: RunFolder) -> tuple[str, Poses] | None:
+    """What `save_poses` wrote to `folder`, or None.
 
     Raises:
-        StorageError: they are damaged.
+        StorageError: it is damaged.
     """
     if not folder.adjusted_poses.exists():
         return None
     arrays, header = load_arrays(folder.adjusted_poses, POSES_KIND)
-    return SavedPoses(**header, camtoworlds={int(i): pose for i, pose in arrays.items()})
+    return header["capture"], {int(i): pose for i, pose in arrays.items()}
+
+
+def with_poses_of_run(capture: Capture, folder: RunFolder) -> Capture | None:
+    """`capture` with the adjusted poses that `folder` keeps; None if there are none, or those of another capture.
+
+    Raises:
+        StorageError: the saved poses are damaged.
+    """
+    if (saved := load_poses(folder)) is None:
+        return None
+    given, poses = saved
+    if max(poses) >= len(capture) or capture.digest(list(poses)) != given:
+        return None
+    frames = [dataclasses.replace(f, camtoworld=poses.get(i, f.camtoworld)) for i, f in enumerate(capture.frames)]
+    return dataclasses.replace(capture, frames=tuple(frames))
 
 
 def capture_to_stream(
@@ -310,30 +312,10 @@ def capture_to_stream(
         if saved is None:
             got, fix = "one with the given poses", "leave it out, or start anew with --overwrite"
             raise refusal("--adjust-poses", wanted="a run that began with it", got=got, fix=fix)
-    elif saved is None or saved.capture != capture.digest(indices):
+    elif saved is None or saved[0] != capture.digest(indices):
         found = adjust_and_say(capture, indices, reporter).capture
-        saved = SavedPoses(capture.digest(indices), {i: found.frames[i].camtoworld for i in indices})
-        saved.save(folder)
-    return saved.of(capture) or capture
-
-
-def with_poses_of_run(
-    capture: Capture, folder: RunFolder, warn: Callable[[str], None] = lambda message: None
-) -> Capture:
-    """`capture` with the adjusted poses that `folder` keeps; as it is, if there are none or those of another capture.
-
-    `warn` is told of those of another capture, or of this one at another size. A run cannot be continued with it: its
-    digest differs.
-
-    Raises:
-        StorageError: the saved poses are damaged.
-    """
-    saved = load_poses(folder)
-    if saved is None:
-        return capture
-    if (adjusted := saved.of(capture)) is None:
-        warn(f"{folder.adjusted_poses} is of another capture: the cameras have the poses of {capture.name}.")
-    return adjusted or capture
+        save_poses(folder, capture.digest(indices), {i: found.frames[i].camtoworld for i in indices})
+    return with_poses_of_run(capture, folder) or capture
 
 
 def open_capture_of_scene(scene: Path, path: str, size: tuple[int, int] | None, reporter: Reporter) -> Capture:
@@ -343,5 +325,9 @@ def open_capture_of_scene(scene: Path, path: str, size: tuple[int, int] | None, 
         InputError: the capture is unusable.
         StorageError: the saved poses are damaged.
     """
-    folder = RunFolder(scene if scene.is_dir() else scene.parent)
-    return with_poses_of_run(open_capture(path, size=size), folder, reporter.warn)
+    folder, capture = RunFolder(scene if scene.is_dir() else scene.parent), open_capture(path, size=size)
+    adjusted = with_poses_of_run(capture, folder)
+    if adjusted is None and folder.adjusted_poses.exists():  # or of this one at another size
+        told = f"{folder.adjusted_poses} is of another capture"
+        reporter.warn(f"{told}: the cameras have the poses of {capture.name}.")
+    return adjusted or capture

@@ -76,10 +76,10 @@ def save_scene(path: Path, gaussians: Gaussians, stream_frame: StreamFrame, expo
     return save_gaussians(path, scene_to_show(gaussians, stream_frame, exposures), offset=stream_frame.offset)
 
 
-def finish_run(run: OpenRun, path: str, reporter: Reporter) -> ExportReport:
+def finish_run(run: OpenRun, path: str, reporter: Reporter) -> int:
     """Writes the scene of a finished stream, pictures of some streamed views, the report, and the metrics.
 
-    Returns what was written to the scene file; `path` is the capture, as the user gave it.
+    Returns the number of Gaussians in the scene file; `path` is the capture, as the user gave it.
 
     Raises:
         StorageError: a file cannot be written.
@@ -111,7 +111,7 @@ def finish_run(run: OpenRun, path: str, reporter: Reporter) -> ExportReport:
     }
     report_run(folder, metrics, path, run.weights)
     write_json(folder.metrics, metrics)
-    return report
+    return report.num_written
 
 
 def shown_frames(indices: Sequence[int]) -> list[int]:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.cameras import Camera
@@ -261,18 +262,12 @@ def camera_path(
     n = len(camtoworlds)
     if n < 2:
         return camtoworlds, Ks
-    places = np.arange((n - 1) * steps + 1) / steps
-    before = np.minimum(places.astype(int), n - 2)
-    t = (places - before)[:, None, None]
-    # Control points before the first and after the last camera are extrapolated.
-    first, last = 2 * camtoworlds[:1] - camtoworlds[1:2], 2 * camtoworlds[-1:] - camtoworlds[-2:-1]
-    points = np.concatenate([first, camtoworlds, last])
-    a, b, c, d = (points[before + i] for i in range(4))
-    path = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
+    given, places = np.arange(n), np.arange((n - 1) * steps + 1) / steps
+    path = CubicHermiteSpline(given, camtoworlds, np.gradient(camtoworlds, axis=0))(places)
     u, _, vt = np.linalg.svd(path[:, :3, :3])
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     path[:, :3, :3] = u @ vt
-    return path, (1 - t) * Ks[before] + t * Ks[before + 1]
+    return path, make_interp_spline(given, Ks, k=1)(places)
 
 
 def upward(camtoworlds: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "3"] | None:

@@ -14,7 +14,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import Effects, fill_holes
-from ssplat_jax.runs.open_run import SavedPoses
+from ssplat_jax.runs.open_run import save_poses
 from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.command_fixture import make_capture, run
@@ -76,7 +76,7 @@ def test_a_run_is_drawn_from_its_adjusted_poses(tmp_path, capture):
     shift = np.eye(4)
     shift[0, 3] = 0.1
     poses = {i: frame.camtoworld @ shift for i, frame in enumerate(opened.frames)}
-    SavedPoses(opened.digest(range(3)), poses).save(folder)
+    save_poses(folder, opened.digest(range(3)), poses)
     assert run("render", folder.path, capture, "--max-views", "1", "--out", tmp_path / "out", "--quiet") == 0
     frames = tuple(dataclasses.replace(frame, camtoworld=poses[i]) for i, frame in enumerate(opened.frames))
     expected = wanted(dataclasses.replace(opened, frames=frames), ss.load_ply(folder.scene), 0, "mip")

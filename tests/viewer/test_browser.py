@@ -13,7 +13,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import fill_holes
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.viewer import browser as browser_module
+from ssplat_jax.viewer import view_scene as browser_module
 from ssplat_jax.viewer.stage import Stage, draw, open_source, visible_splats
 from ssplat_jax.viewer.view_scene import Browser, Viewer
 from tests.viewer.fake_client import FakeClient, delta, frame, free_port, header
