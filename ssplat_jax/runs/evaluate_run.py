@@ -69,7 +69,10 @@ def evaluate_run(model: StreamSplat, params: dict, options: Eval, reporter: Repo
     folder = without_tilde(split_options(path)[0])
     are_scenes = options.scene is None and folder.is_dir() and not is_capture(folder)
     if options.index is not None:
-        index, notes = _read_index(options)
+        clash = [name for name in ("stride", "context", "targets") if getattr(options, name) is not None]
+        if clash := [*clash, *["protocol"] * (options.protocol != Eval.protocol)]:
+            raise refusal("--index", wanted="no frames chosen otherwise", got=f"--{clash[0]} too", fix="leave one out")
+        index, notes = read_index(options.index)
     elif are_scenes and any(map(is_capture, folder.iterdir())):
         index, notes = index_of_folder(options)
     else:
@@ -100,16 +103,6 @@ def evaluate_run(model: StreamSplat, params: dict, options: Eval, reporter: Repo
 def _split(capture: Capture, options: Eval) -> Split:
     """The frames of a capture by the protocol."""
     return choose_split(options.protocol, len(capture), options.stride, options.context, options.targets)
-
-
-def _read_index(options: Eval) -> tuple[Index, tuple[str, ...]]:
-    """The index file of the options, which choose frames in no other way, and notes for the user."""
-    assert options.index is not None
-    chosen = {name: getattr(options, name) for name in ("stride", "context", "targets")}
-    chosen["protocol"] = None if options.protocol == "interleaved" else options.protocol
-    if clash := [name for name, value in chosen.items() if value is not None]:
-        raise refusal("--index", wanted="no frames chosen otherwise", got=f"--{clash[0]} too", fix="leave one out")
-    return read_index(options.index)
 
 
 def index_of_folder(options: Eval) -> tuple[Index, tuple[str, ...]]:

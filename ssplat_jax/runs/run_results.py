@@ -227,12 +227,14 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
 
 def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path, str]], **parts: Any) -> None:
     """Writes a page with these pictures and further parts."""
+    found = metrics | metrics["cache"] | metrics["stream_frame"]
+    figures = {name.replace("_", " "): x for name, x in found.items() if isinstance(x, str | int | float)}
     page = report_page(
         title=metrics["capture"],
         pictures=[pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)],
         # A run writes its metrics after the report: with them, everything is there.
         files=[row for row in DESCRIBED_FILES if row[0] == folder.metrics.name or (folder.path / row[0]).exists()],
-        details=_details(metrics),
+        details=[(name, f"{x:.6g}" if isinstance(x, float) else str(x)) for name, x in figures.items()],
         **parts,
     )
     write_atomic(folder.report, page.encode(errors="replace"))
@@ -255,10 +257,3 @@ def _caption(score: dict[str, Any], kind: str) -> str:
         f"{kind} frame {score['frame']} · shown {shown['psnr']:.2f} dB, SSIM {shown['ssim']:.3f}"
         f" · literal {literal['psnr']:.2f} dB"
     )
-
-
-def _details(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """The single figures among the metrics, for those who look closer."""
-    found = metrics | metrics["cache"] | metrics["stream_frame"]
-    figures = {name.replace("_", " "): x for name, x in found.items() if isinstance(x, str | int | float)}
-    return [(name, f"{x:.6g}" if isinstance(x, float) else str(x)) for name, x in figures.items()]

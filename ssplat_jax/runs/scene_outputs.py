@@ -205,37 +205,31 @@ def render_run(options: Render, reporter: Reporter) -> int:
     indices = range(0, len(capture), stride)[: options.max_views]
     size = (capture.width, capture.height)
     writer = None if film is None else VideoWriter(*size)
-    background = None if options.over_black else mean_color(splats)
+    background = mean_color(splats)  # of holes that have no colors around them
+    at_camera = replace(splats, offset=(0.0, 0.0, 0.0))  # cameras are relative to it already
+
+    def picture(camtoworld: Pose, K: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+        """The scene from one camera of the capture's frame."""
+        camera = _camera_at(camtoworld, K, size, splats.offset)
+        out = render(at_camera, camera, effects=effects_for(at_camera, camera))
+        return np.asarray(out.color if options.over_black else _jitted_fill_holes(out.color, out.alpha, background))
+
     with lock_folder(options.out):
         folder.clear_views()
         folder.film.unlink(missing_ok=True)
         with reporter.progress("rendering", len(indices)) as advance:
             for place, i in enumerate(indices, start=1):
-                picture = _render_picture(splats, capture.frames[i].camtoworld, capture.K(i), size, background)
-                save_image(folder.view(i), picture)
+                save_image(folder.view(i), picture(capture.frames[i].camtoworld, capture.K(i)))
                 advance(place)
         if film is not None and writer is not None:
             poses = np.stack([capture.frames[i].camtoworld for i in indices])
             cameras = camera_path(poses, np.stack([capture.K(i) for i in indices]), film)
             with reporter.progress("filming", len(cameras[0])) as advance:
                 for place, (pose, K) in enumerate(zip(*cameras, strict=True), start=1):
-                    writer.add(eight_bits(_render_picture(splats, pose, K, size, background)))
+                    writer.add(eight_bits(picture(pose, K)))
                     advance(place)
             writer.save(folder.film)
     return len(indices)
-
-
-def _render_picture(
-    splats: Gaussians, camtoworld: Pose, K: Intrinsics, size: tuple[int, int], background: jax.Array | None
-) -> Float[np.ndarray, "h w 3"]:
-    """A scene from one camera of the capture's frame.
-
-    `background` is the color of holes that have no colors around them; None shows all holes black.
-    """
-    camera = _camera_at(camtoworld, K, size, splats.offset)
-    scene = replace(splats, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
-    out = render(scene, camera, effects=effects_for(scene, camera))
-    return np.asarray(out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background))
 
 
 def _camera_at(camtoworld: Pose, K: Intrinsics, size: tuple[int, int], offset: tuple[float, float, float]) -> Camera:

@@ -102,27 +102,21 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
         except json.JSONDecodeError:
             value = math.inf if text == "inf" else text
         value = tuple(value) if isinstance(value, list) else value
-        held = config.preset if name == "preset" else config.get(name)
+        group, field = config.find(name)
+        held, kinds = config.get(name), get_args(get_type_hints(type(getattr(config, group)))[field])
         # A field that takes a word or a number (scene_scale) holds a word by default; the configuration checks both.
-        if not isinstance(held, str) and not (value is None and _admits_none(config, name)):
+        if not isinstance(held, str) and not (value is None and type(None) in kinds):
             value = float(value) if isinstance(held, float) and type(value) is int else value
             if held is not None and type(value) is not type(held):
                 raise InputError(f"--set {name}: wanted a value like {held!r}, got {text!r}.")
-        place = name if name in ("preset", *config.groups()) else ".".join(config.find(name))
-        before, first = given.setdefault(place, (value, change))
+        before, first = given.setdefault((group, field), (value, change))
         if before != value:
             raise InputError(
-                f"--set: wanted one value of {place}, got {first} and {change}: drop one; --causal and"
+                f"--set: wanted one value of {group}.{field}, got {first} and {change}: drop one; --causal and"
                 f" --watch set stream.causal, --online-refine sets stream.steps_per_chunk."
             )
         parsed[name] = value
     return config.replace(**parsed)
-
-
-def _admits_none(config: StreamConfig, name: str) -> bool:
-    """True if None is a value of the field."""
-    group, field = config.find(name)
-    return type(None) in get_args(get_type_hints(type(getattr(config, group)))[field])
 
 
 def stopped(by: int, after: str, *, overwrites: bool = False) -> int:
@@ -254,7 +248,15 @@ class Run(StreamOptions):
     """With --watch: end after so many seconds without a new frame; a file `done` in the capture ends it at once."""
 
     def run(self) -> int:
-        self._check()
+        from ssplat_jax.data.posed_image import split_options
+
+        if self.quiet_seconds != Run.quiet_seconds and not self.watch:
+            raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
+        if self.port != Run.port and not self.view:
+            raise InputError("--port: wanted --view beside it, which it is for; got none.")
+        if self.watch and split_options(self.path)[1]:
+            wanted, got = "transforms.json as it is, without depth maps", "--axes, --poses or --depth"
+            raise InputError(f"--watch: wanted {wanted}, got {got}; leave it out.")
         if not self.view:
             return self._stream_and_refine()
         from ssplat_jax.viewer.view_scene import viewer_beside
@@ -265,18 +267,6 @@ class Run(StreamOptions):
             print("the viewer stays open; Ctrl-C ends it", flush=True)
             ended = wait_for_viewer()
         return 128 + ended if ended else 0
-
-    def _check(self) -> None:
-        """Refuses options that contradict each other."""
-        from ssplat_jax.data.posed_image import split_options
-
-        if self.quiet_seconds != Run.quiet_seconds and not self.watch:
-            raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
-        if self.port != Run.port and not self.view:
-            raise InputError("--port: wanted --view beside it, which it is for; got none.")
-        if self.watch and split_options(self.path)[1]:
-            wanted, got = "transforms.json as it is, without depth maps", "--axes, --poses or --depth"
-            raise InputError(f"--watch: wanted {wanted}, got {got}; leave it out.")
 
     def _stream_and_refine(self) -> int:
         """Streams, prints a summary, then refines if requested; returns the exit code."""
@@ -329,12 +319,7 @@ class Eval(StreamOptions):
         if "scenes" in metrics:
             scores = _both_scores(metrics["over_scenes"])
             print(f"{len(metrics['scenes'])} scenes: {scores}; {self.out}/metrics.json, {self.out}/*/report.html")
-        else:
-            self._print(metrics)
-        return 0
-
-    def _print(self, metrics: dict) -> None:
-        """Prints the scores of one capture."""
+            return 0
         reference = metrics["baselines"]
         print(
             f"{metrics['capture']}, {metrics['target_views']} views: {_both_scores(metrics)} (copying the nearest view"
@@ -346,6 +331,7 @@ class Eval(StreamOptions):
                 f"before {refined['num_steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"
                 f" {_both_scores(refined['before'])}"
             )
+        return 0
 
 
 def _both_scores(scores: dict) -> str:

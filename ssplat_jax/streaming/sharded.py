@@ -104,7 +104,8 @@ class ShardedStream:
             cache = _without_axis(shard)
             prediction = model.predict(params, cache, chunk)
             tokens, output = _from_first_shard((prediction.tokens, prediction.output))
-            return _with_axis(model.update_cache(cache, replace(prediction, tokens=tokens, output=output))), output
+            cache = model.update_cache(cache, replace(prediction, tokens=tokens, output=output))
+            return jax.tree.map(lambda x: x[None], cache), output
 
         def step_device(params, shards, chunks):
             return jax.lax.map(lambda x: step_stream(params, *x), (shards, chunks))
@@ -151,10 +152,6 @@ def _auto(mesh: Mesh) -> Mesh:
 def _without_axis(shard: VoxelCache) -> VoxelCache:
     """The cache of a stream on one device, from its block `[1, ...]` of the shards."""
     return jax.tree.map(lambda x: x[0], shard)
-
-
-def _with_axis(cache: VoxelCache) -> VoxelCache:
-    return jax.tree.map(lambda x: x[None], cache)
 
 
 def _from_first_shard(tree: PyTree) -> PyTree:
