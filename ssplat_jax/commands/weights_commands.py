@@ -77,6 +77,11 @@ class Train:
         reporter.say(f"{recipe.num_steps} steps{duration}; Ctrl-C saves them, and the same command continues")
         waiting = "compiling; figures come every ten steps"
         with reporter.progress("training", recipe.num_steps, waiting=waiting) as advance:
+
+            def report(record: dict) -> None:
+                shown = ("loss", "depth_l1", "psnr", "accepted")  # what fits beside the bar
+                advance(record["step"], "  ".join(f"{name} {record[name]:.3f}" for name in shown if name in record))
+
             result = train(
                 config,
                 recipe,
@@ -87,7 +92,7 @@ class Train:
                 mix=mix,
                 lpips_weights=lpips_weights,
                 save_every=self.save_every,
-                report=lambda record: advance(record["step"], _describe_record(record)),
+                report=report,
                 say=reporter.say,
                 warn=reporter.warn,
             )
@@ -141,12 +146,6 @@ class Train:
         if fresh := [name for name, stage in params.items() if stage and name not in given]:
             reporter.say(f"{self.init_weights} gives no {', '.join(fresh)}: random at the start")
         return config, given, params
-
-
-def _describe_record(record: dict) -> str:
-    """Numbers of a training record that fit beside a progress bar."""
-    shown = ("loss", "depth_l1", "psnr", "accepted")
-    return "  ".join(f"{name} {record[name]:.3f}" for name in shown if name in record)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,7 +4,6 @@ frames of a capture, or of a folder that is still being written -> chunks -> ses
 -> scene, pictures, report, metrics
 """
 
-import dataclasses
 import time
 from collections.abc import Iterator
 
@@ -19,7 +18,7 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import check_look_ahead
 from ssplat_jax.runs.open_run import OpenRun, open_run
 from ssplat_jax.runs.run_results import finish_run, finished_scene
-from ssplat_jax.runs.stream_commands import Run
+from ssplat_jax.runs.stream_commands import Run, stopped
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder
 from ssplat_jax.storage.saved_states import load_newest_state
@@ -33,18 +32,8 @@ POLL_SECONDS = 0.25
 """Seconds between two looks at a folder that is still being written."""
 
 
-@dataclasses.dataclass(frozen=True)
-class RunResult:
-    """State of a run when `run_capture` returns."""
-
-    num_views: int
-    num_gaussians: int  # 0 if it was interrupted
-    interrupted: int | None = None  # the signal that stopped it, if one did
-    was_finished: bool = False  # the folder held it already; nothing was streamed or written
-
-
-def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Reporter) -> RunResult:
-    """Streams a capture into a folder, continuing the run that the folder holds.
+def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Reporter) -> int:
+    """Streams a capture into a folder, continuing the run that the folder holds, and says so; returns the exit code.
 
     Every image is decoded once, when its chunk is due. A damaged one stops the stream there, with what came before it
     saved; once it is mended, the run continues.
@@ -70,21 +59,28 @@ def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Report
         chunk_size, state, num_saved = model.config.stream.chunk_size, RunFolder(options.out), 0
         if state.has_state() and not options.overwrite:
             num_saved = load_newest_state(state.state)[1]["done"]
-        if stopped := source.wait_for(max(num_saved, chunk_size)):
-            return RunResult(num_saved, 0, stopped)
+        if received := source.wait_for(max(num_saved, chunk_size)):
+            return stopped(received, f"after {num_saved} views", overwrites=options.overwrite)
         indices = source.indices[: num_saved or chunk_size]
     kept = {"adjust_poses": options.adjust_poses, "overwrite": options.overwrite}
     with open_run(model, params, source.capture, indices, options.out, **kept, reporter=reporter) as run:
         num_before, width, height = run.num_views, run.capture.width, run.capture.height
         if options.size is None and width * height > LARGE:
             reporter.say(f"images are streamed at {width}x{height}; --size takes smaller ones in less time")
-        if stopped := _stream(run, source, options, reporter):
-            return RunResult(run.num_views, 0, stopped)
+        if received := _stream(run, source, options, reporter):
+            return stopped(received, f"after {run.num_views} views", overwrites=options.overwrite)
+        num_finished = None
         if run.num_views > num_before:
             run.folder.clear_refinement()  # of a scene of fewer views
-        elif (num_written := finished_scene(run.folder, run.num_views)) is not None:
-            return RunResult(run.num_views, num_written, was_finished=True)
-        return RunResult(run.num_views, finish_run(run, options.path, reporter))
+        else:
+            num_finished = finished_scene(run.folder, run.num_views)
+        num_gaussians = finish_run(run, options.path, reporter) if num_finished is None else num_finished
+    scene = f"scene.ply ({num_gaussians} Gaussians from {run.num_views} views)"
+    if num_finished is None:
+        print(f"wrote {options.out}/{scene}; pictures and figures: {options.out}/report.html")
+    else:
+        print(f"{options.out} holds this run, finished: {scene}, views/, metrics.json; --overwrite starts it anew")
+    return 0
 
 
 def _stream(run: OpenRun, source: "WholeCapture | GrowingCapture", options: Run, reporter: Reporter) -> int | None:

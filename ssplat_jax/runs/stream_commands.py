@@ -269,21 +269,14 @@ class Run(StreamOptions):
         return 128 + ended if ended else 0
 
     def _stream_and_refine(self) -> int:
-        """Streams, prints a summary, then refines if requested; returns the exit code."""
+        """Streams, then refines if requested; returns the exit code."""
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.capture_run import run_capture
 
         model, params = self.load_model(causal=self.causal or self.watch)
-        result = run_capture(model, params, self, Reporter(self.quiet))
-        if result.interrupted:
-            return stopped(result.interrupted, f"after {result.num_views} views", overwrites=self.overwrite)
-        scene = f"scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)"
-        if result.was_finished:
-            print(f"{self.out} holds this run, finished: {scene}, views/, metrics.json; --overwrite starts it anew")
-        else:
-            print(f"wrote {self.out}/{scene}; pictures and figures: {self.out}/report.html")
-        if not self.refine_steps:
-            return 0
+        code = run_capture(model, params, self, Reporter(self.quiet))
+        if code or not self.refine_steps:
+            return code
         same = {name: getattr(self, name) for name in ("capture", "weights", "overwrite", "axes", "poses", "quiet")}
         return Refine(self.out, steps=self.refine_steps, **same).run()
 
@@ -357,7 +350,7 @@ class Demo:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.runs.demo import run_demo
+        from ssplat_jax.runs.evaluate_run import run_demo
 
         reporter = Reporter(self.quiet)
         reporter.say("about a minute on two cores, most of it for compiling")

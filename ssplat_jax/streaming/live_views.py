@@ -92,8 +92,13 @@ class LiveViews:
         if measured.shape != (height, width) or not np.issubdtype(measured.dtype, np.floating):
             got, fix = f"{measured.dtype} {list(measured.shape)}", "give camera z in the unit of the poses"
             raise refusal("push: depth", wanted=f"floats [{height}, {width}]", got=got, fix=fix)
-        matrix = _checked_K(K, width, height)
-        frame = Frame(str(self._num_views), camtoworld, matrix, width, height, is_masked=not mask.all())
+        matrix = np.asarray(K, np.float64)
+        if matrix.shape != (3, 3):
+            raise refusal("push: K", wanted="a 3x3 matrix", got=echo(matrix.tolist()), fix="give intrinsics in pixels")
+        check_matrices(np.eye(4), matrix, "push", complete=True)
+        (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
+        camera = check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where="push: K")
+        frame = Frame(str(self._num_views), camtoworld, camera, width, height, is_masked=not mask.all())
         self._size = (width, height)
         self._waiting.append((frame, pixels, mask, measured.astype(np.float32)))
         self._num_views += 1
@@ -141,13 +146,3 @@ def _checked_image(image: object) -> Float32[np.ndarray, "h w 3"]:
         return pixels.astype(np.float32) / np.float32(255)
     check_images(pixels, "push: image")
     return pixels.astype(np.float32).clip(0, 1)
-
-
-def _checked_K(K: object, width: int, height: int):
-    """Intrinsics of an image of that size."""
-    matrix = np.asarray(K, np.float64)
-    if matrix.shape != (3, 3):
-        raise refusal("push: K", wanted="a 3x3 matrix", got=echo(matrix.tolist()), fix="give intrinsics in pixels")
-    check_matrices(np.eye(4), matrix, "push", complete=True)
-    (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
-    return check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where="push: K")

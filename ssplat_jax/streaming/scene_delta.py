@@ -59,7 +59,7 @@ class SceneFeed:
     def __init__(self, model: StreamSplat, params: dict, known: VoxelCache | None = None) -> None:
         self._params, k = params, model.config.memory.pivots_per_voxel
         self._shown_pivots = jax.jit(lambda cache: shown_pivots(cache, model.config))
-        self._total_weight = jax.jit(lambda cache: total_weight(cache.observations))
+        self._total_weight = jax.jit(total_weight)
         self._decode_rows = jax.jit(lambda params, cache, rows: model.decode_rows(params, cache, _pivots_of(rows, k)))
         self._record = _Record(0, np.zeros((0, k), bool), np.zeros((0, k), np.float32))
         if known is not None:
@@ -89,7 +89,7 @@ class SceneFeed:
         is_changed = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= last.next_chunk)
         is_changed |= shown != np.pad(last.shown, more)
         if cache.observations is not None:
-            seen = np.asarray(self._total_weight(cache))
+            seen = np.asarray(self._total_weight(cache.observations))
             is_changed |= shown & (seen != np.pad(last.seen, more))
         rows = np.flatnonzero(is_changed.any(axis=1)).astype(np.int32)
         return rows, _Record(int(cache.stats.num_chunks), shown, seen)
