@@ -28,7 +28,7 @@ from jax.flatten_util import ravel_pytree
 from ssplat_jax.config import PRESETS, StreamConfig, preset
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.model.network import init_params, stages_of
-from ssplat_jax.storage.files import check_tensors, load_arrays, read_tensors, save_arrays
+from ssplat_jax.storage.files import load_arrays, read_tensors, save_arrays
 
 KIND = "weights 1"
 
@@ -290,7 +290,11 @@ def import_params(path: Path, config: StreamConfig, *, depth_only: bool = False)
             f"{path}: wanted weights of ReSplat, its depth network or Depth Anything V2; the file has none of their"
             f" {len(shapes)} tensors."
         )
-    check_tensors(path, found, usable)
+    for name, shape in usable.items():
+        if (got := found[name].shape) != shape:
+            raise InputError(f"{path}: wanted {name} of shape {shape}, got {got}; is it another network's?")
+        if not np.isfinite(found[name]).all():
+            raise InputError(f"{path}: {name} holds values that are not finite; fetch the file again.")
     incomplete = {place.partition("/")[0] for place, t in by_place.items() if t is None or t.name not in usable}
     fresh = init_params(jax.random.key(0), config, incomplete)
 

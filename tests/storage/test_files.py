@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.errors import InputError, StorageError
-from ssplat_jax.storage.files import check_tensors, json_text, load_arrays, read_tensors, save_arrays
+from ssplat_jax.storage.files import json_text, load_arrays, read_tensors, save_arrays
 
 TENSORS = {
     "a": np.arange(6, dtype=np.float32).reshape(2, 3),
@@ -64,5 +64,4 @@ def test_tensors_are_read_as_float32_and_integers_left_out(form, tmp_path):
     for length in range(0, path.stat().st_size, 5):
         path.with_name("cut").write_bytes(path.read_bytes()[:length])
         with pytest.raises(InputError):
-            held = read_tensors(path.with_name("cut"))
-            check_tensors(path, held, {"a": (2, 3), "wide": (2,), "half": (3,), "brain": (4,)})
+            read_tensors(path.with_name("cut"))
