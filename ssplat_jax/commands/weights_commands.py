@@ -207,9 +207,10 @@ class Weights:
 
         params = load_params(self.name)
         facts = describe_weights(self.name)
-        print(
-            f"{self.name}: preset {facts.config.preset!r}, {facts.num_bytes / 1e6:.1f} MB{_training(facts.provenance)}"
-        )
+        told = (("steps", "{} steps"), ("init_weights", "from {}"), ("imported_from", "imported from {}"))
+        words = [text.format(facts.provenance[name]) for name, text in told if facts.provenance.get(name)]
+        training = ", " + " ".join(words) if words else ""
+        print(f"{self.name}: preset {facts.config.preset!r}, {facts.num_bytes / 1e6:.1f} MB{training}")
         if "imported_from" in trainings(facts.provenance)[0]:
             print("imported weights have no random start to compare with")
             return 0
@@ -218,10 +219,3 @@ class Weights:
             num_params = sum(leaf.size for leaf in jax.tree.leaves(params[stage]))
             print(f"{stage:<12}{num_params:>12,}{share:>10.3f}")
         return 0
-
-
-def _training(provenance: dict) -> str:
-    """The training in words, as far as the file tells it."""
-    told = (("steps", "{} steps"), ("init_weights", "from {}"), ("imported_from", "imported from {}"))
-    words = [text.format(provenance[name]) for name, text in told if provenance.get(name)]
-    return ", " + " ".join(words) if words else ""

@@ -99,20 +99,6 @@ def views_of(scene: Path, path: str | None, reporter: Reporter) -> KnownCameras 
     return KnownCameras(capture.camtoworlds, Ks, (capture.width, capture.height), np.ones((len(capture), 3)))
 
 
-def turn_up(views: KnownCameras | None, up: str, to: Path) -> Float64[np.ndarray, "3 3"]:
-    """The rotation after which the up direction of cameras held level is an axis of the file, +y or +z.
-
-    Raises:
-        InputError: no cameras are known, or they do not tell what is up.
-    """
-    now = None if views is None else upward(views.camtoworlds)
-    if now is None:
-        fix = "export a run, or pass --cameras CAPTURE"
-        raise refusal("--up", wanted="cameras that are held level", got="none", fix=fix)
-    wanted = file_axes(to).T @ np.eye(3)["xyz".index(up)]
-    return Rotation.align_vectors(wanted, now)[0].as_matrix()  # the shortest one
-
-
 def turned(gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> Gaussians:
     """A scene after a rotation about the origin of its capture."""
     stream_frame = StreamFrame(turn, np.zeros(3), scale=1.0, near=0.0, far=math.inf)
@@ -141,15 +127,23 @@ def export_scene(
         scene: the Gaussians, in the capture's frame.
         to: the file to write; its suffix names the format.
         views: cameras of the scene.
-        up: the axis of the file, `y` or `z`, that is to point up; None leaves the axes of the capture.
+        up: the axis of the file, +y or +z, that the up direction of cameras held level becomes; None leaves the axes of
+            the capture.
         options: those of `save_gaussians`.
 
     Raises:
-        InputError: see `save_gaussians` and `turn_up`.
+        InputError: see `save_gaussians`; or `up` is given, and no cameras are known or they do not tell what is up.
         StorageError: the file cannot be written.
     """
-    turn = np.eye(3) if up is None else turn_up(views, up, to)
-    shown = scene if up is None else turned(scene, turn)
+    turn, shown = np.eye(3), scene
+    if up is not None:
+        now = None if views is None else upward(views.camtoworlds)
+        if now is None:
+            fix = "export a run, or pass --cameras CAPTURE"
+            raise refusal("--up", wanted="cameras that are held level", got="none", fix=fix)
+        wanted = file_axes(to).T @ np.eye(3)["xyz".index(up)]
+        turn = Rotation.align_vectors(wanted, now)[0].as_matrix()  # the shortest one
+        shown = turned(scene, turn)
     start = None if views is None else start_camera(views, shown, turn)
     return save_gaussians(to, shown, start_camera=start, **options), turn
 

@@ -271,13 +271,9 @@ def import_params(path: Path, config: StreamConfig, *, depth_only: bool = False)
         depth_only: import the depth network only, as from a checkpoint of DepthSplat, whose later stages differ.
 
     Raises:
-        InputError: `config` has another network, or the file is of another kind, is damaged, has no tensors of this
-            network, has only some tensors of a part, or has tensors of other shapes.
+        InputError: the file is of another kind, is damaged, has no tensors of this network, has only some tensors of a
+            part, or has tensors of other shapes.
     """
-    if config.network.kind != "resplat":
-        raise InputError(
-            f"import-weights: wanted a preset of ReSplat's network (paper, small, base), got {config.preset!r}."
-        )
     found = read_tensors(path)
     if not any(name.startswith("encoder.") for name in found):  # a depth network without the model around it
         found = {DEPTH + name: x for name, x in found.items()}
