@@ -127,8 +127,8 @@ def export_scene(
         scene: the Gaussians, in the capture's frame.
         to: the file to write; its suffix names the format.
         views: cameras of the scene.
-        up: the axis of the file, +y or +z, that the up direction of cameras held level becomes; None leaves the axes of
-            the capture.
+        up: the axis of the file, `y` or `z`, along which the up direction of cameras held level is turned; None leaves
+            the axes of the capture.
         options: those of `save_gaussians`.
 
     Raises:
