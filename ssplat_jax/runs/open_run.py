@@ -183,16 +183,8 @@ class SavedRun:
     folder: RunFolder
     cache: VoxelCache
     header: dict[str, Any]
-
-    @property
-    def stream_frame(self) -> StreamFrame:
-        """The similarity between the capture's frame and the stream's."""
-        return StreamFrame.from_dict(self.header["frame"])
-
-    @property
-    def exposures(self) -> Exposures:
-        """Exposures of the streamed frames."""
-        return exposures_from_json(self.header["exposures"])
+    stream_frame: StreamFrame  # the similarity between the capture's frame and the stream's
+    exposures: Exposures  # of the streamed frames
 
     def session(self, params: dict) -> Session:
         """The stream, to be decoded with the parameters that it was streamed with.
@@ -237,7 +229,8 @@ def load_run(run_dir: Path, reporter: Reporter) -> SavedRun:
     cache, header, damage = load_newest_state(folder.state)
     if damage is not None:
         reporter.warn(f"{damage} Taking the state saved before it, after {header['done']} views.")
-    return SavedRun(folder, cache, header)
+    stream_frame, exposures = StreamFrame.from_dict(header["frame"]), exposures_from_json(header["exposures"])
+    return SavedRun(folder, cache, header, stream_frame, exposures)
 
 
 def _image_digests(capture: Capture, frames) -> dict[str, str]:
