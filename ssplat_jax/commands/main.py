@@ -57,11 +57,8 @@ SETTINGS_OF_OTHERS = (
 """Prefixes of environment variables that `main` removes, so that commands compute in float32 as JAX does by default."""
 
 
-PLATFORMS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
-"""JAX's variables that choose the device."""
-
-WITHOUT_PROGRAMS = "--no-program-cache"
-"""Option of every command; it comes before the options of each are read."""
+PLATFORMS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # JAX's variables that choose the device
+WITHOUT_PROGRAMS = "--no-program-cache"  # option of every command; it comes before the options of each are read
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -18,17 +18,13 @@ from pathlib import Path
 
 import platformdirs
 
-SWITCH = "SSPLAT_PROGRAM_CACHE"
-"""Environment variable: `off`, or a folder in place of the user's cache folder."""
-
-EXECUTABLES = "SSPLAT_EXECUTABLES"
-"""`core.kept_programs.SWITCH`: folder of the executables. That module imports JAX."""
+SWITCH = "SSPLAT_PROGRAM_CACHE"  # environment variable: `off`, or a folder in place of the user's cache folder
+EXECUTABLES = "SSPLAT_EXECUTABLES"  # `core.kept_programs.SWITCH`: folder of the executables. That module imports JAX.
 
 FOLDER, IS_ON = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
 """JAX's own variables: where they are set, they hold."""
 
-LEAST_SECONDS = "0.3"
-"""Shortest compilation of a program that is stored."""
+LEAST_SECONDS = "0.3"  # shortest compilation of a program that is stored
 
 
 def keep_programs(environment: MutableMapping[str, str] = os.environ) -> None:

@@ -25,11 +25,8 @@ from ssplat_jax.storage.saved_states import load_newest_state
 from ssplat_jax.streaming.scene_delta import SceneFeed
 from ssplat_jax.streaming.session import FedChunk, feed_chunks, middle_exposure
 
-LARGE = 640 * 480
-"""Pixels of an image above which a run says that smaller ones take less time."""
-
-POLL_SECONDS = 0.25
-"""Seconds between two looks at a folder that is still being written."""
+LARGE = 640 * 480  # pixels of an image above which a run says that smaller ones take less time
+POLL_SECONDS = 0.25  # seconds between two looks at a folder that is still being written
 
 
 def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Reporter) -> int:

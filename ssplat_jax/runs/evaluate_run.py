@@ -36,8 +36,7 @@ from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Exposures, Session, feed_chunks
 
-SCORES = ("literal", "shown")
-"""Scores of a scene that are averaged over scenes."""
+SCORES = ("literal", "shown")  # scores of a scene that are averaged over scenes
 
 
 def evaluate_run(model: StreamSplat, params: dict, options: Eval, reporter: Reporter) -> dict[str, Any]:
@@ -187,8 +186,7 @@ def _weighted_mean(values: list[Any], weights: np.ndarray) -> Any:
 SHOWN_PIVOTS = 1 << 16
 """Pivots that are decoded after every stage, as many as after the last: every number is a program to compile."""
 
-STAGES = (4, 8, 16, 32, 64)
-"""Numbers of streamed views after which the scene is decoded and scored."""
+STAGES = (4, 8, 16, 32, 64)  # numbers of streamed views after which the scene is decoded and scored
 
 
 def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:

@@ -22,8 +22,7 @@ from ssplat_jax.storage.saved_states import check_same
 
 KIND = "refinement state 1"
 
-MEASURED = ("max_pairs", "max_rows", "losses", "held_back", "seconds")
-"""Fields of `Progress` that JSON holds."""
+MEASURED = ("max_pairs", "max_rows", "losses", "held_back", "seconds")  # fields of `Progress` that JSON holds
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,8 +29,7 @@ from ssplat_jax.streaming.session import Exposures, middle_exposure
 
 _jitted_scale_colors = Kept(scale_colors)
 
-NUM_PICTURES = 8
-"""Streamed views, evenly spread, that are rendered from the finished scene."""
+NUM_PICTURES = 8  # streamed views, evenly spread, that are rendered from the finished scene
 
 MOST_PICTURES, MOST_CHUNKS = 12, 10
 """Pictures on a page and rows of its table; of more, evenly spread ones are shown."""

@@ -23,12 +23,8 @@ from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.streaming.scene_delta import SceneDelta
 
 RECORD_KIND, DELTA_KIND = "chunk record 1", "scene delta 1"  # kind and version of the files
-
-SHAPES = {"camtoworld": (4, 4), "K": (3, 3), "exposure": (3,)}
-"""The arrays of a view."""
-
-THUMBNAIL_SIDE = 160
-"""Longest side of a thumbnail, pixels."""
+SHAPES = {"camtoworld": (4, 4), "K": (3, 3), "exposure": (3,)}  # the arrays of a view
+THUMBNAIL_SIDE = 160  # longest side of a thumbnail, pixels
 
 
 @dataclasses.dataclass(frozen=True)

@@ -199,8 +199,7 @@ def _shapes(config: StreamConfig) -> dict:
 # -- weights of ReSplat ------------------------------------------------------------------------------------------------
 
 
-DEPTH = "encoder.depth_predictor."
-"""Prefix of the depth network's tensors."""
+DEPTH = "encoder.depth_predictor."  # prefix of the depth network's tensors
 
 PREFIXES = {
     "encoder": DEPTH,

@@ -20,14 +20,10 @@ from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsic
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.streamsplat import ChunkOutput
 
-END_SHARE = 1 / 32
-"""Share of the range of inverse depths that counts as its end."""
-MAX_END_SHARE = 0.2
-"""Share of the confident cells of a chunk that may lie at an end."""
-STEP = 1.5
-"""Factor by which an end moves."""
-MIN_CELLS = 64
-"""Confident cells below which a chunk contradicts nothing."""
+END_SHARE = 1 / 32  # share of the range of inverse depths that counts as its end
+MAX_END_SHARE = 0.2  # share of the confident cells of a chunk that may lie at an end
+STEP = 1.5  # factor by which an end moves
+MIN_CELLS = 64  # confident cells below which a chunk contradicts nothing
 
 
 def widen_range(stream_frame: StreamFrame, output: ChunkOutput, config: StreamConfig) -> StreamFrame:

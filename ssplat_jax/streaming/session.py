@@ -28,8 +28,7 @@ from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, count_gaussia
 from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.streaming.live_views import LiveViews, widen_range
 
-INITIAL_CHUNKS = 4
-"""A new cache has capacity for this many chunks in which every token opens a voxel."""
+INITIAL_CHUNKS = 4  # a new cache has capacity for this many chunks in which every token opens a voxel
 
 NEW_SHARE, MOST_ROWS = 0.75, 1 << 17
 """Share of a stream's tokens for which its cache has capacity from the start, since others meet a voxel that is there,

@@ -28,8 +28,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 
-AXES = STREAMS, VOXELS = "streams", "voxels"
-"""Axes of the mesh."""
+AXES = STREAMS, VOXELS = "streams", "voxels"  # axes of the mesh
 
 
 @dataclasses.dataclass(frozen=True)

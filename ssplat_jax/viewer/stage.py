@@ -174,11 +174,8 @@ def open_source(path: Path) -> Source:
 # -- stage -------------------------------------------------------------------------------------------------------------
 
 
-MAX_SIGMA = 250.0
-"""Largest standard deviation that is sent: the square of 256 overflows a 16-bit float."""
-
-KINDS = ("color", "depth")
-"""Kinds of picture."""
+MAX_SIGMA = 250.0  # largest standard deviation that is sent: the square of 256 overflows a 16-bit float
+KINDS = ("color", "depth")  # kinds of picture
 
 DRAFT, FINE = (320, 240), (960, 640)
 """Sizes (width, height) of pictures while the camera moves, and when it rests. They are fixed, so that few programs are

@@ -29,23 +29,12 @@ from ssplat_jax.storage.chunk_records import RecordedView, open_thumbnail
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder
 from ssplat_jax.viewer.stage import DRAFT, FINE, KINDS, GrowingScene, Source, Stage, draw
 
-POLL_INTERVAL = 0.5
-"""Seconds between checks for changes, so that browsers are sent at most two scenes a second."""
-
-TICK = 1 / 30
-"""Seconds between updates of the browsers."""
-
-LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
-"""Addresses that only this machine can reach."""
-
+POLL_INTERVAL = 0.5  # seconds between checks for changes, so that browsers are sent at most two scenes a second
+TICK = 1 / 30  # seconds between updates of the browsers
+LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")  # addresses that only this machine can reach
 MOST_BESIDE_RUN = 500_000  # Gaussians sent to a browser
-
-LOWER_PRIORITY = 19
-"""`os.nice` of the viewer process (19 = lowest priority)."""
-
-SPLATS = "splats"
-"""The choice of what to show that the browser draws itself."""
-
+LOWER_PRIORITY = 19  # `os.nice` of the viewer process (19 = lowest priority)
+SPLATS = "splats"  # the choice of what to show that the browser draws itself
 FRUSTUM_DEPTH = 0.06  # in the browser's units
 MOST_FRUSTA = 300  # of more views, evenly spread ones are shown
 
