@@ -4,6 +4,7 @@ import functools
 import hashlib
 import importlib.metadata
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -60,31 +61,28 @@ def store(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def entry_kept(plain, tmp_path_factory):
-    """Name and bytes of the entry of `fused_twice`."""
+def kept(plain, tmp_path_factory):
+    """A store with the entry of `fused_twice`."""
     folder = tmp_path_factory.mktemp("kept") / "store"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(SWITCH, str(folder))
         assert fused_twice() == (plain, 1)
         kept_programs.drop_loaded()
-    (entry,) = folder.iterdir()
-    return entry.name, entry.read_bytes()
+    return folder
 
 
 @pytest.fixture
-def entry(store, entry_kept):
+def entry(store, kept):
     """The entry of `fused_twice`, in the store."""
-    name, data = entry_kept
-    store.mkdir(mode=0o700)
-    (store / name).touch(mode=0o600)
-    (store / name).write_bytes(data)
-    return store / name
+    shutil.copytree(kept, store)
+    (entry,) = store.iterdir()
+    return entry
 
 
 @pytest.mark.usefixtures("compiled_plainly")
 def test_a_second_stream_neither_traces_nor_compiles(store, monkeypatch):
     def streamed():
-        model = StreamSplat(NARROW.replace(capacity=1024, hpda=False, cgfi=False, mixer_blocks=0))
+        model = StreamSplat(NARROW.replace(capacity=1024, hpda=False, cgfi=False, mixer_blocks=0, detail=False))
         session = Session(model, random_params(model.config))
         capture = open_capture("procedural:room?frames=8&size=32x32")
         feed_capture(session, capture, range(8), capture.stream_frame(model.config, range(8)))
@@ -117,8 +115,7 @@ def test_processes_that_fill_a_store_at_once_agree_and_the_next_compiles_nothing
 def test_an_entry_that_cannot_be_trusted_is_replaced(harm, store, entry, plain):
     data = entry.read_bytes()
     if harm == "of another program":
-        other = Kept(init_cache, static_argnums=(0,))
-        other(CONFIG)
+        Kept(init_cache, static_argnums=(0,))(CONFIG)
         (foreign,) = set(store.iterdir()) - {entry}
         os.replace(foreign, entry)
     elif harm == "writable by others":
@@ -135,20 +132,16 @@ def test_an_entry_that_cannot_be_trusted_is_replaced(harm, store, entry, plain):
 @pytest.mark.parametrize("what", ["jax", "XLA_FLAGS", "precision"])
 def test_another_version_flag_or_setting_has_its_own_program(what, store, entry, plain, monkeypatch):
     assert fused_twice() == (plain, 0)
-    before = jax.config.jax_default_matmul_precision
-    if what == "jax":
-        real = importlib.metadata.version
-        monkeypatch.setattr(importlib.metadata, "version", lambda name: "9.9" if name == "jax" else real(name))
-    elif what == "XLA_FLAGS":
-        monkeypatch.setenv("XLA_FLAGS", "--another")  # XLA has read the variable already
-    else:
-        jax.config.update("jax_default_matmul_precision", "highest")
+    version = importlib.metadata.version
+    with monkeypatch.context() as patch, jax.default_matmul_precision("highest" if what == "precision" else None):
+        if what == "jax":
+            patch.setattr(importlib.metadata, "version", lambda name: "9.9" if name == "jax" else version(name))
+        if what == "XLA_FLAGS":
+            patch.setenv("XLA_FLAGS", "--another")  # XLA has read the variable already
+        kept_programs._place.cache_clear()
+        assert fused_twice() == (plain, 1)
     kept_programs._place.cache_clear()
-    assert fused_twice() == (plain, 1)
     assert len(list(store.iterdir())) == 2
-    jax.config.update("jax_default_matmul_precision", before)
-    monkeypatch.undo()
-    kept_programs._place.cache_clear()
 
 
 def test_without_a_place_to_write_programs_are_compiled(tmp_path, plain, monkeypatch):

@@ -21,11 +21,8 @@ def tensors() -> dict[str, np.ndarray]:
     return {name: np.full(shape, i, np.float32) for i, (name, shape) in enumerate(shapes.items())}
 
 
-@pytest.fixture(scope="module")
-def depth_network(tensors, tmp_path_factory):
-    """File of the depth network alone, without the prefix of the model around it."""
-    path = tmp_path_factory.mktemp("upstream") / "depth.npz"
-    np.savez(path, **{name.removeprefix(DEPTH): x for name, x in tensors.items() if name.startswith(DEPTH)})
+def saved(path, **arrays):
+    np.savez(path, **arrays)
     return path
 
 
@@ -59,10 +56,12 @@ def test_a_parameter_is_found_by_its_name(place, shape, name, theirs):
 
 
 @pytest.mark.slow
-def test_a_depth_network_leaves_other_parts_initialized(depth_network, tensors):
-    imported = import_params(depth_network, CONFIG)
+def test_a_depth_network_leaves_other_parts_initialized(tensors, tmp_path):
+    """A file of the depth network alone, without the prefix of the model around it."""
+    alone = {name.removeprefix(DEPTH): x for name, x in tensors.items() if name.startswith(DEPTH)}
+    imported = import_params(saved(tmp_path / "depth.npz", **alone), CONFIG)
     assert imported.initialized_parts == ["decoder", "mixer", "tokens"]
-    assert imported.num_imported == sum(name.startswith(DEPTH) for name in tensors) and imported.num_unused == 0
+    assert imported.num_imported == len(alone) and imported.num_unused == 0
     wanted = jax.eval_shape(lambda key: init_params(key, CONFIG), jax.random.key(0))
     shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
     assert shapes(imported.params) == shapes(wanted)
@@ -79,20 +78,14 @@ def test_a_depth_network_leaves_other_parts_initialized(depth_network, tensors):
 
 @pytest.mark.slow
 def test_the_depth_network_of_depthsplat_can_be_imported(tmp_path, tensors):
-    path = tmp_path / "depthsplat.ckpt.npz"
     other = {f"{HEAD}0.weight": np.zeros((37, 64, 3, 3), np.float32), "encoder.feature_upsampler.x": np.zeros(3)}
     pretrained = {name: x for name, x in tensors.items() if ".pretrained." in name or ".backbone." in name}
-    np.savez(path, **pretrained, **other)
+    path = saved(tmp_path / "depthsplat.ckpt.npz", **pretrained, **other)
     with pytest.raises(InputError, match=r"encoder\.gaussian_head"):
         import_params(path, CONFIG)
     imported = import_params(path, CONFIG, depth_only=True)
     assert imported.num_imported == len(pretrained) and imported.num_unused == 2
     assert not {"encoder/backbone", "encoder/pretrained"} & set(imported.initialized_parts)
-
-
-def saved(path, **arrays):
-    np.savez(path, **arrays)
-    return path
 
 
 def test_files_of_other_networks_are_refused(tmp_path, tensors):

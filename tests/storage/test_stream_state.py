@@ -55,7 +55,7 @@ def test_batches_of_caches_are_refused_and_not_written(saved, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_no_damaged_file_is_loaded(saved, tmp_path):
+def test_no_damaged_foreign_or_missing_file_is_loaded(saved, tmp_path):
     contents, rng, damaged = bytearray(saved.read_bytes()), np.random.default_rng(0), tmp_path / "damaged.npz"
     ends = [*range(64), *range(len(contents) - 100, len(contents))]  # records of the zip format, and the checksum
     lengths = [*np.linspace(0, len(contents) - 1, 10).astype(int), len(contents) - 64, len(contents) - 65]
@@ -67,9 +67,6 @@ def test_no_damaged_file_is_loaded(saved, tmp_path):
         damaged.write_bytes(held)
         with pytest.raises(StorageError, match=r"damaged\.npz: the file is corrupt"):
             load_state(damaged)
-
-
-def test_foreign_and_missing_files_are_refused(tmp_path):
     np.savez(tmp_path / "foreign.npz", x=np.zeros(3))
     for name in ("foreign.npz", "absent.npz"):
         with pytest.raises(StorageError, match=name):

@@ -20,8 +20,6 @@ from ssplat_jax.storage.weights import (
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 
-TINY = preset("tiny")
-
 
 @pytest.fixture(scope="module")
 def params():
@@ -56,17 +54,17 @@ def test_weights_may_have_stages_that_are_switched_off(params):
 
 def test_training_changes_a_stage_and_decay_does_not():
     """Also where a later training added a stage, which is compared with its own start."""
-    first, later = (init_params(jax.random.key(seed), TINY) for seed in (3, 7))
+    first, later = (init_params(jax.random.key(seed), NARROW) for seed in (3, 7))
     params = jax.tree.map(lambda x: 0.9 * x, first)
     rng = np.random.default_rng(0)
     params["encoder"] = jax.tree.map(lambda x: x + 0.1 * rng.normal(size=x.shape), params["encoder"])
     provenance = {"recipe": {"seed": 7}, "fresh": ["evidence"], "before": {"recipe": {"seed": 3}}}
-    shares = changed_shares(params | {"evidence": later["evidence"]}, WeightsFacts(TINY, provenance, 0))
+    shares = changed_shares(params | {"evidence": later["evidence"]}, WeightsFacts(NARROW, provenance, 0))
     before, after = (np.asarray(ravel_pytree(tree["encoder"])[0], np.float64) for tree in (first, params))
     cosine = before @ after / np.linalg.norm(before) / np.linalg.norm(after)
     assert shares.pop("encoder") == pytest.approx(np.sqrt(1 - cosine**2), rel=1e-4)
     assert len(shares) > 3 and max(shares.values()) < 1e-6
-    assert changed_shares(later, WeightsFacts(TINY, provenance, 0))["encoder"] > 0.5
+    assert changed_shares(later, WeightsFacts(NARROW, provenance, 0))["encoder"] > 0.5
 
 
 def test_matcher_and_evidence_head_of_the_shipped_weights_are_trained_and_other_stages_are_not():
