@@ -1,7 +1,9 @@
 """Errors that users can cause. The command line prints each as one line and exits with its code."""
 
+import contextlib
 import importlib
 import math
+from collections.abc import Iterator
 from typing import Any
 
 
@@ -61,6 +63,26 @@ def echo(value: object) -> str:
     """A value from outside as text that is safe to print: one line, escaped, at most `MAX_ECHO_LENGTH` characters."""
     text = ascii(value)
     return text if len(text) <= MAX_ECHO_LENGTH else text[: MAX_ECHO_LENGTH - 3] + "..."
+
+
+AGAIN = "write the file again"
+
+
+@contextlib.contextmanager
+def reading(where: object, fix: str = AGAIN) -> Iterator[None]:
+    """Context in which whatever a parser raises becomes an `InputError` that names `where` and the cause.
+
+    The parsers of NumPy, Pillow and `struct` raise nearly any exception on damaged data, so the block should hold the
+    parser alone: a mistake of ours in it would pass for damage.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        cause = getattr(error, "strerror", None) or str(error)
+        got = f"{type(error).__name__} {echo(' '.join(cause.split()))}"
+        raise refusal(str(where), wanted="a readable file", got=got, fix=fix) from error
 
 
 def optional_package(name: str, extra: str) -> Any:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
@@ -17,12 +16,10 @@ from ssplat_jax.data.sparse_matches import fit_poses, keypoints_of, pose_warning
 LOW_STEP = 0.012  # step between frames over median depth, below which four consecutive frames have little parallax
 GOOD_STEP = 0.03  # step over median depth that a suggested stride aims at
 HIGH_STEP = 0.6  # step over median depth, above which neighboring frames hardly overlap
-MAX_FOCAL_RATIO = 4.0  # largest over smallest focal length; above it there is a warning
 JUMP_RATIO = 20.0  # step over median step, above which there is a warning
 LOW_PARALLAX_DEGREES = 2.0  # median over the points, below which depth is uncertain
 MIN_FRAMES = 8  # with fewer, disorder is not looked for
 SHUFFLED_RANK = 0.15  # of the number of frames; median rank of the next camera among the nearest, above which
-ASIDE_RATIO = 5.0  # steps to and from a frame over the median step, and over the step from its neighbor to the other
 
 UNITS = {
     "path_length": "capture units",
@@ -117,9 +114,6 @@ def _depth_warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray
     if longest > JUMP_RATIO:
         where = f"{longest:.0f} median steps between frames {i} and {i + 1}"
         found.append(f"A jump of {where}: check that the frames are one stream and in order.")
-    focals = [frame.K[0, 0] for frame in capture.frames]
-    if max(focals) > MAX_FOCAL_RATIO * min(focals):
-        found.append(f"Focal lengths from {min(focals):.0f} to {max(focals):.0f} pixels: check the intrinsics.")
     return found
 
 
@@ -129,25 +123,11 @@ def order_warnings(capture: Capture) -> list[str]:
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
     if len(capture) < MIN_FRAMES or not (steps > 0).any():
         return []
-    rank = float(np.median([_rank(centers, i) for i in range(len(steps))]))
+    ranks = [np.sum(np.linalg.norm(centers - centers[i], axis=-1) < step) for i, step in enumerate(steps)]
+    rank = float(np.median(ranks))
     if rank > max(3.0, SHUFFLED_RANK * len(capture)):
         return [
             f"Frames are not in the order of a path: the next camera is only the {rank:.0f}th nearest of"
             f" {len(capture)}, at the median; name the images in the order of filming."
         ]
-    skipping = np.linalg.norm(centers[2:] - centers[:-2], axis=-1)
-    least = ASIDE_RATIO * np.maximum(float(np.median(steps[steps > 0])), skipping)
-    aside = [int(i) + 1 for i in np.flatnonzero((steps[:-1] > least) & (steps[1:] > least))]
-    if not aside:
-        return []
-    listed = ", ".join(map(str, aside[:4])) + (", ..." if len(aside) > 4 else "")
-    return [
-        f"{len(aside)} cameras stand far off the path between their neighbors (frames {listed}): they are out"
-        " of order or their poses are wrong; move them or leave them out."
-    ]
-
-
-def _rank(centers: Float64[np.ndarray, "n 3"], i: int) -> int:
-    """Place of the camera after camera `i` among those nearest to it, from 1; ties count for it."""
-    distances = np.linalg.norm(centers - centers[i], axis=-1)
-    return int(np.sum(distances < distances[i + 1])) - (0 if distances[i + 1] == 0 else 1) + 1
+    return []

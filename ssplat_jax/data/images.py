@@ -15,8 +15,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
 from skimage import transform
 
-from ssplat_jax.core.errors import refusal
-from ssplat_jax.data.parsing import reading
+from ssplat_jax.core.errors import reading, refusal
 
 IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 MAX_PIXELS = 64_000_000  # larger images are refused before anything is decoded
@@ -36,10 +35,9 @@ def image_size(path: Path) -> tuple[int, int]:
 def check_depth_header(path: Path) -> None:
     """Refuses a file that is no 16-bit depth image."""
     with _open(path) as image:
-        if image.mode not in DEPTH_MODES or zero_is_white(image):
-            got = "a TIFF whose zero is white" if zero_is_white(image) else f"mode {image.mode}"
-            fix = "store depth as 16-bit PNG"
-            raise refusal(str(path), wanted="one channel of 16 bits, from 0 for unknown", got=got, fix=fix)
+        if image.mode not in DEPTH_MODES:
+            wanted, fix = "one channel of 16 bits, from 0 for unknown", "store depth as 16-bit PNG"
+            raise refusal(str(path), wanted=wanted, got=f"mode {image.mode}", fix=fix)
 
 
 def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
@@ -54,7 +52,6 @@ def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 
         if image.mode in DEPTH_MODES:
             white = (1 << image.tag_v2.get(BITS, (16,))[0]) - 1 if isinstance(image, TiffImageFile) else 65535
             gray = np.asarray(image, dtype=np.float32) / np.float32(white)
-            gray = 1 - gray if zero_is_white(image) else gray
             return np.repeat(np.clip(gray, 0, 1)[..., None], 3, axis=-1)
         if image.has_transparency_data:
             rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
@@ -62,11 +59,6 @@ def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 
         pixels = np.array(image.convert("RGB"), dtype=np.float32)
         pixels /= np.float32(255)  # in place: photographs have hundreds of megabytes as floats
         return pixels
-
-
-def zero_is_white(image: Image.Image) -> bool:
-    """True for a TIFF of 16-bit gray whose zero is white, which Pillow leaves as it is stored."""
-    return image.format == "TIFF" and image.mode in DEPTH_MODES and image.getexif().get(PHOTOMETRIC) == 0
 
 
 def image_flags(path: Path) -> tuple[bool, bool]:
@@ -132,6 +124,8 @@ def _open(path: Path) -> Image.Image:
         wanted, got, fix = f"{MAX_PIXELS:,} pixels at most", f"{image.width}x{image.height}", "scale the images down"
     elif image.mode == "F" or (is_tiff and image.mode == "I"):  # the value of white is unknown
         wanted, got, fix = "8 or 16 bits per channel", "floats or 32-bit integers", "convert the images"
+    elif is_tiff and image.mode in DEPTH_MODES and image.getexif().get(PHOTOMETRIC) == 0:  # Pillow does not invert it
+        wanted, got, fix = "gray from black to white", "a TIFF whose zero is white", "convert the images"
     elif is_tiff and image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # Pillow applies it to TIFFs only
         wanted, got = "an upright image", "a TIFF with an orientation tag"
         fix = "rotate the pixels, drop the tag, and see that the intrinsics are those of the rotated image"

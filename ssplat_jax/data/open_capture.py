@@ -7,15 +7,13 @@ import contextlib
 import dataclasses
 import shlex
 from pathlib import Path
-from urllib.parse import parse_qsl
 
 import numpy as np
 
-from ssplat_jax.core.errors import InputError, echo, refusal
+from ssplat_jax.core.errors import InputError, echo, reading, refusal
 from ssplat_jax.core.kept_programs import kept_arrays
 from ssplat_jax.data.capture import MAX_SIDE, ArrayPixels, Capture, FilePixels, capture_of_listing
 from ssplat_jax.data.images import MAX_PIXELS
-from ssplat_jax.data.parsing import reading
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, split_options
 from ssplat_jax.data.readers import CAPTURE_READERS
 from ssplat_jax.data.readers.frame_list import Listing, files_in, in_stream_order
@@ -27,10 +25,10 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", "
 ARCHIVES = frozenset({".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})
 PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
+PROCEDURAL_OPTIONS = {"frames": (), "size": (), "seed": (), "depth": ("on", "off")}
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
 PROCEDURAL_SIZE = (128, 96)  # (width, height), at which the demo takes about a minute on two cores
-DONE = "done"
-"""A file of this name in the folder of a growing capture says that nothing more will come."""
+DONE = "done"  # a file of this name in the folder of a growing capture says that nothing more will come
 
 
 def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Capture:
@@ -151,12 +149,8 @@ def is_done(path: Path) -> bool:
 
 def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
     """The procedural capture of a path, rendered immediately; `size` is that of images where `spec` has none."""
-    name, _, query = spec.removeprefix(f"{PROCEDURAL}:").partition("?")
-    given = parse_qsl(query, keep_blank_values=True)
-    options = dict(given)
-    if len(options) < len(given) or not options.keys() <= {"frames", "size", "seed", "depth"}:
-        fix = f"write {PROCEDURAL}:{name}?frames={PROCEDURAL_FRAMES}&size=128x96&seed=0"
-        raise refusal(spec, wanted="the options frames, size, seed, depth, each once", got=echo(query), fix=fix)
+    path, options = split_options(spec, PROCEDURAL_OPTIONS)
+    name = path.removeprefix(f"{PROCEDURAL}:")
     num_frames = _whole(spec, "frames", options.get("frames", str(PROCEDURAL_FRAMES)), 1, 100_000)
     seed = _whole(spec, "seed", options.get("seed", "0"), 0, 2**31 - 1)
     width, height = size or PROCEDURAL_SIZE
@@ -165,8 +159,6 @@ def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
         if len(sides) != 2:
             raise refusal(f"{spec}: size", wanted="WIDTHxHEIGHT", got=echo(options["size"]), fix="write 128x96")
         width, height = (_whole(spec, "size", side, 8, MAX_SIDE) for side in sides)
-    if options.get("depth", "off") not in ("on", "off"):
-        raise refusal(f"{spec}: depth", wanted="on or off", got=echo(options["depth"]), fix="change the option")
     # Imported here because the scenes load their textures, which no other capture needs.
     from ssplat_jax.data.procedural.procedural_views import procedural_capture_arrays
 

@@ -6,43 +6,20 @@ Numbers may be NaN or infinite here, so that a later check can name the pose or 
 import contextlib
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.core.errors import InputError, echo, refusal
+from ssplat_jax.core.errors import AGAIN, InputError, echo, reading, refusal
 
-MAX_BYTES = 1 << 30  # of a text file; those of real captures take some megabytes
-AGAIN = "write the file again"
 UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
-
-
-@contextlib.contextmanager
-def reading(where: object, fix: str = AGAIN) -> Iterator[None]:
-    """Context in which whatever a parser raises becomes an `InputError` that names `where` and the cause.
-
-    The parsers of NumPy, Pillow and `struct` raise nearly any exception on damaged data, so the block should hold the
-    parser alone: a mistake of ours in it would pass for damage.
-    """
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        cause = getattr(error, "strerror", None) or str(error)
-        got = f"{type(error).__name__} {echo(' '.join(cause.split()))}"
-        raise refusal(str(where), wanted="a readable file", got=got, fix=fix) from error
 
 
 def load_text(path: Path) -> str:
     """The text of a UTF-8 file, with or without a byte order mark."""
     with reading(path):
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise refusal(str(path), wanted=f"at most {MAX_BYTES:,} bytes", got=f"{size:,}", fix="split the capture")
         return path.read_bytes().decode("utf-8-sig")
 
 
@@ -71,19 +48,11 @@ def load_json(path: Path, kind: type = dict) -> Any:
     """The value of a JSON file, which must be an object (`dict`) or a `list`."""
     text = load_text(path)
     with reading(path):
-        value = json.loads(text, object_pairs_hook=lambda pairs: _unique(pairs, path))
+        value = json.loads(text)
     if not isinstance(value, kind):
         wanted = "a JSON object" if kind is dict else "a JSON list"
         raise refusal(str(path), wanted=wanted, got=f"a {type(value).__name__}", fix=AGAIN)
     return value
-
-
-def _unique(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
-    """Dict of `pairs`. JSON itself would take the last of two values of a key in silence."""
-    fields = dict(pairs)
-    if len(fields) != len(pairs):
-        raise refusal(str(path), wanted="every key once", got=f"one of {echo(list(fields))} twice", fix="remove one")
-    return fields
 
 
 class Fields:

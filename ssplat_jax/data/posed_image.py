@@ -9,6 +9,7 @@ and `poses` at the end of the capture's path, such as `scene?axes=opencv&poses=w
 import dataclasses
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -71,12 +72,11 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     if pose.shape != (4, 4):
         got = f"shape {pose.shape}" if pose.ndim and pose.size else echo(matrix)
         raise refusal(where, wanted="a 4x4 matrix of numbers", got=got, fix="write four rows of four numbers")
-    _check_finite(pose, where)
+    _check_numbers(pose, pose[:3, 3], where)
     if not np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0], rtol=0, atol=1e-6):
         transposed = np.array_equal(pose[:, 3], [0.0, 0.0, 0.0, 1.0])
         fix = "transpose the matrix" if transposed else "give a rigid camera-to-world transform"
         raise refusal(where, wanted="a last row of 0 0 0 1", got=echo(pose[3].tolist()), fix=fix)
-    _check_coordinates(pose[:3, 3], where)
     rotation = pose[:3, :3]
     # Huge entries overflow in the product: an infinite deviation is refused like any other.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -92,13 +92,10 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     return pose, deviation
 
 
-def _check_finite(values: np.ndarray, where: str) -> None:
+def _check_numbers(values: np.ndarray, translation: Float64[np.ndarray, "3"], where: str) -> None:
+    """Refuses numbers that are not finite, and a camera that is absurdly far away: its reconstruction diverged."""
     if not np.isfinite(values).all():
         raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
-
-
-def _check_coordinates(translation: Float64[np.ndarray, "3"], where: str) -> None:
-    """Refuses a camera that is absurdly far away: its reconstruction diverged."""
     farthest = np.abs(translation).max()
     if farthest > MAX_COORDINATE:
         fix = "drop the frame or choose a larger unit"
@@ -112,8 +109,7 @@ def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.
         InputError: a value is not finite, a coordinate is too large, or the quaternion is shorter than 1e-6.
     """
     quat, translation = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
-    _check_finite(np.concatenate([quat, translation]), where)
-    _check_coordinates(translation, where)
+    _check_numbers(np.concatenate([quat, translation]), translation, where)
     length = math.hypot(*quat)  # does not overflow before the length does
     if not 1e-6 <= length < math.inf:
         got = f"a quaternion of length {length:.2g}"
@@ -189,26 +185,26 @@ class Convention:
         return {name: getattr(self, name) for name in ("axes", "poses") if getattr(self, name) != getattr(usual, name)}
 
 
-USUAL = Convention()
-"""The convention of captures in memory, and of formats that do not say otherwise."""
+USUAL = Convention()  # the convention of captures in memory, and of formats that do not say otherwise
 
 CONVENTIONS = tuple(Convention(axes, poses) for axes in get_args(Axes) for poses in get_args(Direction))
 
-_OPTIONS = re.compile(r"\?((?:axes|poses|depth)=[^&?/]*(?:&(?:axes|poses|depth)=[^&?/]*)*)$")
+OPTIONS = {"axes": get_args(Axes), "poses": get_args(Direction), "depth": ("on", "off")}
+"""Options behind the path of a capture, and their values; empty for any value."""
 
 
-def split_options(path: str) -> tuple[str, dict[str, str]]:
+def split_options(path: str, allowed: Mapping[str, tuple[str, ...]] = OPTIONS) -> tuple[str, dict[str, str]]:
     """Splits `path?axes=...&poses=...&depth=...` into path and options; unknown and repeated values are refused."""
-    found = _OPTIONS.search(path)
+    option = f"(?:{'|'.join(allowed)})=[^&?/]*"
+    found = re.search(rf"\?({option}(?:&{option})*)$", path)
     if found is None:
         return path, {}
     options: dict[str, str] = {}
-    allowed = {"axes": get_args(Axes), "poses": get_args(Direction), "depth": ("on", "off")}
     for part in found[1].split("&"):
         name, _, value = part.partition("=")
-        if value not in allowed[name] or name in options:
-            got = "it twice" if name in options else value or "nothing"
-            wanted = " or ".join(allowed[name])
+        if (allowed[name] and value not in allowed[name]) or name in options:
+            got = "it twice" if name in options else echo(value)
+            wanted = " or ".join(allowed[name]) or "one value"
             raise refusal(f"{path[: found.start()]}: {name}", wanted=wanted, got=got, fix="change the option")
         options[name] = value
     return path[: found.start()], options

@@ -56,10 +56,10 @@ class PosedImages(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Keypoints:
-    """ORB keypoints of an image."""
+    """Keypoints of an image."""
 
     pixels: Float64[np.ndarray, "n 2"]  # positions in the delivered image
-    descriptors: Bool[np.ndarray, "n 256"]
+    descriptors: Bool[np.ndarray, "n 256"] | Float32[np.ndarray, "n 128"]  # of ORB, or of SIFT
     pixel: float  # size of a working-image pixel in pixels of the delivered image
 
 
@@ -142,8 +142,8 @@ def keypoints_of(capture: PosedImages) -> KeypointsOf:
     return functools.cache(lambda i: only_seen(detect_keypoints(capture.image(i)), capture.seen(i)))
 
 
-def only_seen(keypoints: Any, seen: Bool[np.ndarray, "h w"] | None) -> Any:
-    """The keypoints (with `pixels` and `descriptors`) of an image that are not masked out."""
+def only_seen(keypoints: Keypoints, seen: Bool[np.ndarray, "h w"] | None) -> Keypoints:
+    """The keypoints of an image that are not masked out."""
     if seen is None:
         return keypoints
     columns, rows = keypoints.pixels.astype(int).T

@@ -174,8 +174,7 @@ def _check_counts(**counts: int) -> None:
 # 1,000 frames of redkitchen score the same with both.
 MAX_INTERLEAVED_CHUNKS = 32
 """Largest number of chunks interleaved at a time: with chunks of 4, 128 frames or about four seconds of video."""
-NUM_MEASURED_STEPS = 31
-"""Steps between cameras by whose median a block is measured: about a second of video."""
+NUM_MEASURED_STEPS = 31  # steps between cameras by whose median a block is measured: about a second of video
 
 
 def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chunk_size: int, step: float) -> list[int]:

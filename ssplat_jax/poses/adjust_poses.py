@@ -19,12 +19,9 @@ ROTATION_DEVIATION = 0.005
 """Assumed error of the given rotations in radians. Real errors are larger, half a degree on phones after some time. The
 smaller value gives the given poses more weight: errors of neighboring matches are alike, and thousands of them tell
 less than as many independent ones."""
-TRANSLATION_DEVIATION = 0.005
-"""Assumed error of the given places, in median depths of the scene."""
-SCALES_DEGREES = (0.4, 0.2)
-"""Scales of the robust loss, one round after another."""
-MIN_TRACKS = 100
-"""Fewest points from which poses are adjusted."""
+TRANSLATION_DEVIATION = 0.005  # assumed error of the given places, in median depths of the scene
+SCALES_DEGREES = (0.4, 0.2)  # scales of the robust loss, one round after another
+MIN_TRACKS = 100  # fewest points from which poses are adjusted
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -32,6 +32,7 @@ from skimage import feature  # which loads SIFT, with scipy.stats, at its first 
 
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.data.sparse_matches import (
+    Keypoints,
     PosedImages,
     epipolar_distances,
     gray_image,
@@ -41,18 +42,14 @@ from ssplat_jax.data.sparse_matches import (
     pixel_rays,
 )
 
-MAX_STEPS = 20
-"""Most steps for a scale of the loss."""
-SMALLEST_FALL = 1e-4
-"""Relative fall of the cost below which the steps for a scale end."""
+MAX_STEPS = 20  # most steps for a scale of the loss
+SMALLEST_FALL = 1e-4  # relative fall of the cost below which the steps for a scale end
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e8
 """Damping relative to the diagonal of the normal equations: at first, and the one from which no step is sought."""
-FAR_WEIGHT = 1e-4
-"""Weight, against a ray, of the point at unit depth on it: it keeps points of parallel rays finite."""
+FAR_WEIGHT = 1e-4  # weight, against a ray, of the point at unit depth on it: it keeps points of parallel rays finite
 MIN_DEPTH = 0.01
 """Depth before a camera, in median depths of the scene, below which a point has no residual but a constant cost."""
-HIDDEN_COST = float(np.log1p(100.0))
-"""Loss of such a point: that of a residual of ten scales."""
+HIDDEN_COST = float(np.log1p(100.0))  # loss of such a point: that of a residual of ten scales
 TINY = 1e-9  # keeps the equations of points that no camera sees solvable
 
 
@@ -207,30 +204,15 @@ def _normal_equations(seen: Observations, unknowns, scale: float, prior):
 # -- tracks ------------------------------------------------------------------------------------------------------------
 
 
-LONG_SIDE = 640
-"""Longer side of the working image in pixels; larger images are reduced."""
-MIN_SIDE = 16
-"""Shortest side of a working image in pixels: SIFT needs some octaves."""
-NUM_PARTNERS = 8
-"""Cameras that each camera is matched with: those most like it."""
-MAX_AXIS_DEGREES = 40.0
-"""Largest angle between the optical axes of a pair."""
-DEGREES_OF_DEPTH = 60.0
-"""Angle between axes that makes cameras as unlike as a distance of one median depth does."""
-MAX_EPIPOLAR_DEGREES = 1.6
-"""Largest distance of a match from its epipolar line: poses may be wrong by that much."""
+LONG_SIDE = 640  # longer side of the working image in pixels; larger images are reduced
+MIN_SIDE = 16  # shortest side of a working image in pixels: SIFT needs some octaves
+NUM_PARTNERS = 8  # cameras that each camera is matched with: those most like it
+MAX_AXIS_DEGREES = 40.0  # largest angle between the optical axes of a pair
+DEGREES_OF_DEPTH = 60.0  # angle between axes that makes cameras as unlike as a distance of one median depth does
+MAX_EPIPOLAR_DEGREES = 1.6  # largest distance of a match from its epipolar line: poses may be wrong by that much
 MAX_DISTANCE, MAX_RATIO = 0.7, 0.8
 """Largest distance between the descriptors of a match, whose length is 1, and its ratio to the second smallest."""
-MIN_MATCHES = 10
-"""Fewest matches of a pair; fewer are mostly false."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class SiftKeypoints:
-    """SIFT keypoints of an image."""
-
-    pixels: Float64[np.ndarray, "n 2"]  # in the delivered image
-    descriptors: Float32[np.ndarray, "n 128"]  # of length 1
+MIN_MATCHES = 10  # fewest matches of a pair; fewer are mostly false
 
 
 def find_tracks(
@@ -263,11 +245,11 @@ def find_tracks(
     return Observations(viewmats, np.stack([capture.K(i) for i in indices]), views, points, pixels)
 
 
-def sift_keypoints(image: Float32[np.ndarray, "h w 3"]) -> SiftKeypoints:
-    """The SIFT keypoints of an image; there are none if it is tiny or has no structure."""
+def sift_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:
+    """The SIFT keypoints of an image, with descriptors of length 1; there are none if it is tiny or uniform."""
     height, width = image.shape[:2]
-    nothing = SiftKeypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     shrink = max(1.0, max(height, width) / LONG_SIDE)
+    nothing = Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32), shrink)
     size = (round(width / shrink), round(height / shrink))
     if min(size) < MIN_SIDE:
         return nothing
@@ -278,7 +260,8 @@ def sift_keypoints(image: Float32[np.ndarray, "h w 3"]) -> SiftKeypoints:
         return nothing
     pixels = (detector.keypoints[:, ::-1] + 0.5) * np.array([width / size[0], height / size[1]])
     descriptors = detector.descriptors.astype(np.float32)
-    return SiftKeypoints(pixels, descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9))
+    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
+    return Keypoints(pixels, descriptors, shrink)
 
 
 def alike_cameras(camtoworlds: Float64[np.ndarray, "v 4 4"], depth: float) -> list[tuple[int, int]]:
@@ -298,7 +281,7 @@ def alike_cameras(camtoworlds: Float64[np.ndarray, "v 4 4"], depth: float) -> li
 
 
 def _match(
-    capture: PosedImages, indices: Sequence[int], pair: tuple[int, int], found: Sequence[SiftKeypoints]
+    capture: PosedImages, indices: Sequence[int], pair: tuple[int, int], found: Sequence[Keypoints]
 ) -> Int[np.ndarray, "n 2"]:
     """Matching keypoints of two views near epipolar lines, which leave a few candidates each."""
     (i, j), (a, b) = (indices[v] for v in pair), (found[v] for v in pair)

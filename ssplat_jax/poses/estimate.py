@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.errors import InputError, echo, optional_package, refusal
+from ssplat_jax.core.errors import InputError, echo, optional_package, reading, refusal
 from ssplat_jax.data.open_capture import VIDEO_SUFFIXES
 from ssplat_jax.poses import gather_images
 from ssplat_jax.storage.files import write_json
@@ -138,19 +138,11 @@ def _check_out(source: Path, out: Path) -> None:
 
 
 def _held_record(out: Path) -> dict[str, Any]:
-    """The record of an earlier call; empty if there was none.
-
-    Raises:
-        InputError: the file of that name is of another maker, whose images must not be removed.
-    """
-    file = out / RECORD
-    try:
-        record = json.loads(file.read_text()) if file.exists() else {}
+    """The record of an earlier call; empty if there was none. The images of another maker must not be removed."""
+    with reading(out / RECORD, "it is of another maker or damaged: choose another --out, or remove the folder"):
+        record = json.loads((out / RECORD).read_text()) if (out / RECORD).exists() else {}
         if record and not isinstance(record["request"], dict):
-            raise TypeError
-    except (ValueError, KeyError, TypeError):
-        got, fix = "a file of another maker, or a damaged one", "choose another --out, or remove the folder"
-        raise refusal(str(file), wanted="the record of an earlier call", got=got, fix=fix) from None
+            raise TypeError("no record of an earlier call")
     return record
 
 

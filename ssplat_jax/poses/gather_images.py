@@ -13,22 +13,18 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from PIL import Image
+from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 from scipy.ndimage import laplace
 
-from ssplat_jax.core.errors import echo, optional_package, refusal
+from ssplat_jax.core.errors import echo, optional_package, reading, refusal
 from ssplat_jax.data.images import DEPTH_MODES, IMAGE_FORMATS, ORIENTATION, UPRIGHT
 from ssplat_jax.data.open_capture import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
-from ssplat_jax.data.parsing import reading
 from ssplat_jax.data.readers.frame_list import files_in, natural
 
 Advance = Callable[[int], None]
 SUFFIXES = IMAGE_SUFFIXES - UNREADABLE_SUFFIXES
 JPEG_QUALITY = 95
-_T = Image.Transpose
-TURNS = dict(enumerate((_T.FLIP_LEFT_RIGHT, _T.ROTATE_180, _T.FLIP_TOP_BOTTOM, _T.TRANSPOSE, _T.ROTATE_270), 2))
-TURNS |= {7: _T.TRANSVERSE, 8: _T.ROTATE_90}  # transpositions that bring photos upright, by the EXIF orientation
 KEPT_FORMATS = ("JPEG", "PNG")  # pycolmap reads no WebP, for one; other formats are converted
 FOCAL_TAGS = (Base.FocalLength, Base.FocalLengthIn35mmFilm, Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
 FOCAL_TAGS += (Base.FocalPlaneResolutionUnit, Base.ExifImageWidth, Base.ExifImageHeight)
@@ -95,7 +91,8 @@ def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Advanc
             if is_kept:
                 shutil.copyfile(photo, folder / name)
             else:
-                upright = picture if orientation == UPRIGHT else picture.transpose(TURNS[orientation])
+                picture.info.pop("exif", None)  # that may be damaged, and need not be written again
+                upright = picture if orientation == UPRIGHT else ImageOps.exif_transpose(picture)
                 _save_upright(upright, folder / name, max_side, exif)
         advance(len(names))
     return names
@@ -110,7 +107,7 @@ def _exif_of(picture: Image.Image) -> tuple[int, bytes]:
     orientation = UPRIGHT
     try:
         exif = picture.getexif()
-        if exif.get(ORIENTATION) in TURNS:
+        if exif.get(ORIENTATION) in range(2, 9):
             orientation = exif[ORIENTATION]
         kept, inner = Image.Exif(), exif.get_ifd(IFD.Exif)
         kept.update({tag: exif[tag] for tag in (Base.Make, Base.Model) if tag in exif})

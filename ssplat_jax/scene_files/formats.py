@@ -2,20 +2,15 @@
 
 import dataclasses
 import os
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zstandard
 from jaxtyping import Float64
-from PIL import Image
 
 from ssplat_jax.core.atomic import write_atomic
-from ssplat_jax.core.errors import InputError, refusal
+from ssplat_jax.core.errors import reading, refusal
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.scene_files.glb import AXIS_FLIP, decode_glb, encode_glb
 from ssplat_jax.scene_files.ply import decode_ply, encode_ply
@@ -31,11 +26,6 @@ WRITERS: dict[str, Callable[..., bytes]] = {".ply": encode_ply, ".spz": encode_s
 WRITERS |= {".glb": encode_glb, ".splat": encode_splat}
 SCENE_READERS: dict[str, Callable[[bytes], SplatRows]] = {".compressed.ply": decode_ply, ".ply": decode_ply}
 SCENE_READERS |= {".spz": decode_spz, ".sog": decode_sog, ".glb": decode_glb}
-DAMAGE = (
-    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, OSError, EOFError),
-    *(struct.error, zlib.error, zipfile.BadZipFile, zstandard.ZstdError, Image.DecompressionBombError),
-)
-"""Errors that struct, JSON, zip, gzip, zstd, PIL and NumPy raise for bytes that are no scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,14 +131,5 @@ def load_ply(path: FilePath) -> Gaussians:
 
 
 def _read(path: FilePath, suffix: str) -> Gaussians:
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        came = f"one that cannot be read ({error.strerror})"
-        raise refusal(str(path), wanted=f"a {suffix} file", got=came, fix="check the path") from error
-    try:
-        with np.errstate(all="ignore"):  # infinities and NaNs are refused by what they mean
-            return gaussians_of_rows(SCENE_READERS[suffix](data))
-    except DAMAGE as error:
-        cause = " ".join((str(error) if type(error) is ValueError else repr(error)).split())
-        raise InputError(f"{path}: cannot be used as a {suffix} file: {cause:.300}; write it again.") from error
+    with reading(f"{path} as a {suffix}"), np.errstate(all="ignore"):  # NaNs are refused by what they mean
+        return gaussians_of_rows(SCENE_READERS[suffix](Path(path).read_bytes()))

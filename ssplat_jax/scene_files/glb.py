@@ -95,8 +95,7 @@ def decode_glb(data: bytes) -> SplatRows:
     if (magic, version, kind) != (MAGIC, VERSION, JSON_CHUNK) or length > len(data):
         raise ValueError(f"wanted a binary glTF of version {VERSION}; it is cut off or none")
     document, buffer = json.loads(data[20 : 20 + size]), data[28 + size :]
-    scenes = document.get("scenes") or [{"nodes": _roots(document)}]
-    nodes = scenes[document.get("scene", 0)].get("nodes", [])
+    nodes = document["scenes"][document.get("scene", 0)].get("nodes", [])
     empty = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3), "opacities": (0,), "sh": (0, 1, 3)}
     parts: list[dict[str, Any]] = [{name: np.zeros(shape) for name, shape in empty.items()}]
     for primitive, transform in _primitives(document, nodes, np.eye(4), set()):
@@ -114,13 +113,6 @@ def decode_glb(data: bytes) -> SplatRows:
         render_mode=mode if mode in RENDER_MODES else "default",
         offset=(x, y, z),
     )
-
-
-def _roots(document: dict) -> list[int]:
-    """The nodes that are no node's children: what a file without scenes shows."""
-    nodes = document.get("nodes", [])
-    inner = {child for node in nodes for child in node.get("children", [])}
-    return [number for number in range(len(nodes)) if number not in inner]
 
 
 def _primitives(

@@ -158,7 +158,7 @@ def placed(columns: dict[str, np.ndarray], transform: Float64[np.ndarray, "3 4"]
     scale = float(np.linalg.norm(linear, axis=0).mean())
     rotation = linear / scale if scale > 0 else linear
     if not (np.abs(rotation.T @ rotation - np.eye(3)) <= UNIFORM).all():
-        raise ValueError("wanted a transform that turns, mirrors, moves and scales, got one that stretches")
+        raise ValueError("wanted a similarity transform, got one that stretches")
     moved = {"means": columns["means"] @ linear.T + shift, "log_scales": columns["log_scales"] + np.log(scale)}
     if np.abs(rotation - np.eye(3)).max() <= ROUNDING:  # not turned: quaternions and SH keep every bit
         return columns | moved

@@ -33,8 +33,7 @@ from ssplat_jax.scene_files.splat_rows import (
 )
 
 MAGIC = b"NGSP"
-VERSIONS = (4, 3)
-"""Versions that are written, the usual one first."""
+VERSIONS = (4, 3)  # versions that are written, the usual one first
 OLD_HEADER = struct.Struct("<4sIIBBBB")
 HEADER = struct.Struct("<4sIIBBBBI12x")
 SIZES, RECORD = struct.Struct("<QQ"), struct.Struct("<II")
@@ -181,8 +180,6 @@ def _joined_frames(data: bytes, table: int, sizes: list[int]) -> bytes:
 
 def _decompressed(frame: bytes, size: int) -> bytes:
     """The contents of a frame of zstd, which must be of a size: nothing larger is allocated."""
-    if size == 0:
-        return b""
     if zstandard.get_frame_parameters(frame).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
         raise ValueError("a frame of another size than the table says")
     contents = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size)

@@ -66,7 +66,7 @@ def test_paths_without_a_capture_are_refused(tmp_path, path, words):
     ("spec", "words"),
     [
         ("procedural:room?frame=3", "frame"),
-        ("procedural:room?frames=4&frames=9", "each once"),
+        ("procedural:room?frames=4&frames=9", "twice"),
         ("procedural:room?frames=0", "frames"),
         ("procedural:room?frames=3.5", "whole number"),
         ("procedural:room?seed=99999999999999999999", "seed"),

@@ -176,7 +176,7 @@ def test_files_cut_off_or_damaged_are_refused(tmp_path, suffix):
         bad.write_bytes(content)
         with pytest.raises(InputError, match="bad"):
             ss.load_scene(bad)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="wanted a readable file"):
         ss.load_scene(tmp_path / f"missing{suffix}")
 
 

@@ -85,12 +85,6 @@ def test_meshes_of_several_nodes_are_one_scene(glb):
     assert not np.any(found.sh[100:, 4:]) and np.any(found.sh[100:, 1:4])
 
 
-def test_a_file_without_scenes_holds_all_its_nodes(glb):
-    del glb.document["scenes"], glb.document["scene"]
-    glb.document["nodes"] = [{"mesh": 0}, {"children": [0], "rotation": [0, 0, 1, 0]}]
-    np.testing.assert_allclose(glb.read().means, scene(3, n=100).means, atol=1e-6)
-
-
 def test_normalized_integers_are_fractions_and_strides_are_kept(glb):
     gaussians = scene(3, n=100)
     opacities = np.round(255 * np.asarray(gaussians.opacities)[:, None]).astype("u1")

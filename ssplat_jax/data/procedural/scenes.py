@@ -311,8 +311,7 @@ def _clutter(b: SceneBuilder) -> Scene:
     return b.build(focus=[0, 0, 0], orbit_radius=0.8, eye=[0, 0, 0], sensor=b.rng.random() < 0.3)
 
 
-SKY_DISTANCE = 30.0
-"""Surfaces of a yard that are farther away, in meters, are sky or the ground near the horizon."""
+SKY_DISTANCE = 30.0  # surfaces of a yard that are farther away, in meters, are sky or the ground near the horizon
 
 
 def _yard(b: SceneBuilder) -> Scene:

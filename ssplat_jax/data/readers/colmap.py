@@ -12,14 +12,15 @@ The parser is our own, because a bare install must read what most captures come 
 """
 
 import contextlib
+import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-from ssplat_jax.core.errors import InputError, echo, refusal
+from ssplat_jax.core.errors import InputError, echo, reading, refusal
 from ssplat_jax.data.images import FisheyeLens, Lens
-from ssplat_jax.data.parsing import UNDISTORT, load_lines, parse_numbers, reading
+from ssplat_jax.data.parsing import UNDISTORT, load_lines, parse_numbers
 from ssplat_jax.data.posed_image import Convention
 from ssplat_jax.data.readers.frame_list import (
     FrameList,
@@ -152,43 +153,24 @@ def _load(model: Path) -> tuple[dict[int, CameraEntry], list[ImageEntry]]:
     return _text_cameras(model / "cameras.txt"), _text_images(model / "images.txt")
 
 
-class _Binary:
-    """Sequential reader of little-endian values."""
-
-    def __init__(self, path: Path) -> None:
-        self.data, self.at = path.read_bytes(), 0
-
-    def take(self, layout: str) -> tuple:
-        """The values of a `struct` layout, which raises at the end of the file."""
-        values = struct.unpack_from("<" + layout, self.data, self.at)
-        self.at += struct.calcsize("<" + layout)
-        return values
-
-    def text(self) -> str:
-        """The UTF-8 text up to the next zero byte."""
-        start, self.at = self.at, self.data.index(b"\0", self.at) + 1
-        return self.data[start : self.at - 1].decode()
-
-    def skip(self, num_bytes: int) -> None:
-        """Skips `num_bytes`."""
-        if self.at + num_bytes > len(self.data):
-            raise ValueError(f"{num_bytes} more bytes expected after byte {self.at}")
-        self.at += num_bytes
+def _take(file: BinaryIO, layout: str) -> tuple:
+    """The next little-endian values of a `struct` layout, which raises at the end of the file."""
+    return struct.unpack("<" + layout, file.read(struct.calcsize("<" + layout)))
 
 
 def _binary_cameras(path: Path) -> dict[int, CameraEntry]:
     """Cameras of cameras.bin by id."""
     cameras = {}
     with reading(path, COPY_AGAIN):
-        file = _Binary(path)
-        for _ in range(*file.take("Q")):
-            camera, model, width, height = file.take("IiQQ")
+        file = io.BytesIO(path.read_bytes())
+        for _ in range(*_take(file, "Q")):
+            camera, model, width, height = _take(file, "IiQQ")
             where = f"{path}: camera {camera}"
             if not 0 <= model < len(MODELS):  # the number of its parameters is unknown, so the rest cannot be read
                 known = ", ".join(name for name, _, _ in MODELS)
                 raise refusal(where, wanted=f"one of {known}", got=f"'model {model}'", fix=UNDISTORT)
             name, params, _ = MODELS[model]
-            values = list(file.take(f"{len(params.split())}d"))
+            values = list(_take(file, f"{len(params.split())}d"))
             cameras[camera] = CameraEntry(name, (float(width), float(height)), values, where)
     return cameras
 
@@ -197,12 +179,14 @@ def _binary_images(path: Path) -> list[ImageEntry]:
     """Images of images.bin; their 2D points are skipped."""
     images = []
     with reading(path, COPY_AGAIN):
-        file = _Binary(path)
-        for _ in range(*file.take("Q")):
-            image, *pose, camera = file.take("I7dI")
-            images.append(ImageEntry(file.text(), pose, camera, f"{path}: image {image}"))
-            (num_points,) = file.take("Q")
-            file.skip(struct.calcsize("<ddq") * num_points)
+        file = io.BytesIO(data := path.read_bytes())
+        for _ in range(*_take(file, "Q")):
+            image, *pose, camera = _take(file, "I7dI")
+            name = file.read(data.index(b"\0", file.tell()) + 1 - file.tell())[:-1].decode()
+            images.append(ImageEntry(name, pose, camera, f"{path}: image {image}"))
+            file.seek(struct.calcsize("<ddq") * _take(file, "Q")[0], io.SEEK_CUR)
+        if file.tell() > len(data):
+            raise ValueError("it is cut off")
     return images
 
 

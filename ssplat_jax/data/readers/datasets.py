@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.core.errors import echo, refusal
+from ssplat_jax.core.errors import AGAIN, echo, reading, refusal
 from ssplat_jax.data.images import Lens, image_size
-from ssplat_jax.data.parsing import AGAIN, load_lines, load_rows, load_text, parse_numbers, reading
+from ssplat_jax.data.parsing import load_lines, load_rows, load_text, parse_numbers
 from ssplat_jax.data.posed_image import Convention, pose_from_quat
 from ssplat_jax.data.readers.frame_list import (
     SHRUNK_FOLDERS,

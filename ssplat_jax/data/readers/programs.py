@@ -8,9 +8,9 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.core.errors import refusal
+from ssplat_jax.core.errors import AGAIN, reading, refusal
 from ssplat_jax.data.images import FisheyeLens, Lens, image_size
-from ssplat_jax.data.parsing import AGAIN, UNDISTORT, Fields, load_json, load_text, parse_numbers, reading
+from ssplat_jax.data.parsing import UNDISTORT, Fields, load_json, load_text, parse_numbers
 from ssplat_jax.data.posed_image import Convention
 from ssplat_jax.data.readers.frame_list import (
     SUFFIXES,
@@ -208,8 +208,6 @@ def _read_metashape(path: Path, convention: Convention) -> Listing:
     notes = [f"{len(others)} more chunks of {file.name} are left out: export each alone."] if others else []
     if len(cameras) < len(listed):
         notes.append(f"{len(listed) - len(cameras)} cameras are left out: they are disabled.")
-    if any((shutter.text or "").strip() not in OFF for shutter in chunk.iter("rolling_shutter")):
-        notes.append("The rolling shutter is not modelled: every image has one pose.")
     for camera in cameras:
         name = str(camera.get("label"))
         where, is_aligned = f"{file}: camera {name}", camera.find("transform") is not None

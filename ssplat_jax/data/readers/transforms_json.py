@@ -8,7 +8,7 @@ image file. Distortion (k1 to k4, p1, p2) follows the Brown-Conrady model, or wi
 `is_fisheye` the fish-eye model (k1 to k4), and is removed when images are delivered; `distortion_params` is the list
 k1 k2 k3 k4 p1 p2, and with FULL_OPENCV k4 to k6 are the denominator. Depth maps (`depth_file_path`, `depth_path`)
 count steps of `integer_depth_scale`, else millimeters times `applied_scale`. Frames with `is_bad` (ScanNet++) are left
-out. A note names fields that are not known. Without a transforms.json, the split transforms_train.json is read.
+out. Without a transforms.json, the split transforms_train.json is read.
 DL3DV keeps the file and its images in a folder `nerfstudio`, which is opened with the folder around it.
 Frames are streamed in the natural order of `file_path`, with the exception in `frame_list.in_stream_order`.
 """
@@ -40,12 +40,6 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of `distortion_params`
 UNKNOWN_LENS = ("k5", "k6", "s1", "s2", "s3", "s4", "xi", "omega", "skew", "orthographic", "equirectangular", "latlong")
 UNKNOWN_LENS += tuple(f"ftheta_p{i}" for i in range(5))  # as the three before, of instant-ngp
-USED = """frames file_path transform_matrix fl_x fl_y cx cy w h camera_angle_x camera_angle_y camera_model is_fisheye
-    distortion_params depth_file_path depth_path integer_depth_scale applied_scale mask_path is_bad rolling_shutter"""
-OF_NO_EFFECT = """applied_transform ply_file_path aabb aabb_scale scale offset up sharpness rotation colmap_im_id
-    train_filenames val_filenames test_filenames orientation_override enable_depth_loading n_extra_learnable_dims
-    license licence note name"""
-KNOWN = frozenset((*USED.split(), *OF_NO_EFFECT.split(), *COEFFICIENTS, *UNKNOWN_LENS))
 UNKNOWN_UNITS = ("depth_scale", "depth_factor", "depth_unit")  # some multiply by these and others divide
 
 
@@ -95,11 +89,6 @@ def read_transforms(path: Path, convention: Convention, problems: list[str] | No
             problems.append(str(error))
             break
     notes = [f"{num_bad} frames are left out, because the file calls them bad (is_bad)."] if num_bad else []
-    times = [fields.get("rolling_shutter") for fields in (meta, *entries) if isinstance(fields, dict)]
-    if any(isinstance(shutter, list) and any(shutter[:3]) for shutter in times):
-        notes.append("The rolling shutter (rolling_shutter) is not modelled: every image has one pose.")
-    if unknown := sorted({name for fields in (meta, *entries) if isinstance(fields, dict) for name in fields} - KNOWN):
-        notes.append(f"Fields that are not known are left out of account: {', '.join(map(echo, unknown))}.")
     if file.name == PLACES[-1]:
         notes.append(f"There is no {PLACES[0]}: {file.name} is read, and the images of other splits are left out.")
     return frames.listing(len(frames.frames), "image", notes)
@@ -134,10 +123,9 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
 
 def _depth_unit(fields: Fields) -> float:
     """Capture units per step of a depth map; fields whose meaning differs from tool to tool are refused."""
+    has_depth = fields.get("depth_file_path") is not None or fields.get("depth_path") is not None
     for name in UNKNOWN_UNITS:
-        if fields.get(name) is not None and any(
-            fields.get(f"depth_{kind}") is not None for kind in ("file_path", "path")
-        ):
+        if has_depth and fields.get(name) is not None:
             fix = "write integer_depth_scale, the capture units in a step of the depth maps, instead"
             raise refusal(f"{fields.where}.{name}", wanted="integer_depth_scale", got=echo(fields.get(name)), fix=fix)
     return fields.number("integer_depth_scale", MILLIMETER * fields.number("applied_scale", 1.0))
