@@ -312,11 +312,7 @@ class Capture:
                 arrays = ahead.result()
                 if following is not None:
                     ahead = reader.submit(self._views, following, config.stream.chunk_size, stream_frame)
-                yield Chunk(
-                    **jax.device_put(
-                        arrays | {"near": np.float32(stream_frame.near), "far": np.float32(stream_frame.far)}
-                    )
-                )
+                yield Chunk(**jax.device_put(arrays))
 
     def _views(self, group: Sequence[int], chunk_size: int, stream_frame: StreamFrame) -> dict[str, np.ndarray]:
         """Arrays of one padded chunk."""
@@ -327,6 +323,7 @@ class Capture:
             images[row], Ks[row] = self.image(i), self.K(i)
         viewmats[: len(group)] = stream_frame.viewmats(np.stack([self.frames[i].camtoworld for i in group]))
         arrays = {"images": images, "viewmats": viewmats, "Ks": Ks, "valid": np.arange(chunk_size) < len(group)}
+        arrays |= {"near": np.float32(stream_frame.near), "far": np.float32(stream_frame.far)}
         if self.is_masked:
             arrays["seen"] = np.ones(images.shape[:3], bool)
             for row, i in enumerate(group):

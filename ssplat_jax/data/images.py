@@ -16,6 +16,7 @@ from PIL.TiffImagePlugin import TiffImageFile
 from skimage import transform
 
 from ssplat_jax.core.errors import reading, refusal
+from ssplat_jax.data.parsing import UNDISTORT
 
 IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 MAX_PIXELS = 64_000_000  # larger images are refused before anything is decoded
@@ -274,6 +275,8 @@ def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: in
 
     Distortion that folds the image is refused: its coefficients probably belong to another model.
     """
+    if isinstance(lens, FisheyeLens) and (lens.p1 or lens.p2):
+        raise refusal(where, wanted="a fish-eye lens of k1 to k4 alone", got="p1 or p2 beside them", fix=UNDISTORT)
     border = _border(width, height)
     # Lines from the principal point to the border.
     spokes = K[:2, 2] + np.linspace(0.0, 1.0, 33)[:, None, None] * (border - K[:2, 2])
@@ -285,7 +288,7 @@ def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: in
         outwards = np.einsum("ksi,ksi->ks", np.diff(moved, axis=0), np.diff(spokes, axis=0))
     if shift > max(width, height) or not (outwards[:, np.linalg.norm(spokes[-1] - spokes[0], axis=-1) > 0] > 0).all():
         shown = ", ".join(f"{name}={value:.3g}" for name, value in dataclasses.asdict(lens).items() if value != 0)
-        fix = "check the coefficients, or undistort first (COLMAP: `colmap image_undistorter`) and set k1..p2 to 0"
+        fix = f"check the coefficients, or {UNDISTORT}"
         raise refusal(where, wanted="a lens that does not fold the image", got=shown, fix=fix)
     return shift
 

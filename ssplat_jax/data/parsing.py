@@ -14,7 +14,8 @@ from jaxtyping import Float64
 
 from ssplat_jax.core.errors import AGAIN, InputError, echo, reading, refusal
 
-UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
+UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`), or cut them into perspective"
+UNDISTORT += " views if they are panoramas (`ns-process-data images --camera-type equirectangular`)"
 
 
 def load_text(path: Path) -> str:

@@ -105,7 +105,7 @@ def choose_split(
             got, fix = f"{len(taken)} frames", "leave the scene out (null in an index file), or ask for fewer"
             wanted = f"{num_targets} targets and {num_context} other frames"
             raise refusal("scannet", wanted=wanted, got=got, fix=fix)
-        options = {"anchors": min(SCANNET_ANCHORS, num_context), "thin_to": SCANNET_FRAMES}
+        options = {"anchors": SCANNET_ANCHORS, "thin_to": SCANNET_FRAMES}
     split = paper_split(len(taken), num_context, targets=num_targets, **options)
     context_frames, target_frames = (tuple(taken[p] for p in places) for places in (split.context, split.targets))
     return Split(protocol=protocol, context=context_frames, targets=target_frames)
@@ -138,12 +138,10 @@ def paper_split(
         thin_to: number of frames to which the trajectory is thinned first (ScanNet: 1088); None keeps all.
     """
     _check_counts(context=context, targets=targets)
-    if not 0 <= anchors <= context:
-        raise refusal("anchors", wanted=f"0 to {context} (the context views)", got=str(anchors), fix="ask for fewer")
     trajectory = _uniform(num_frames, num_frames if thin_to is None else thin_to)
     chosen_targets = [trajectory[p] for p in _uniform(len(trajectory), targets)]
     pool = [i for i in trajectory if i not in set(chosen_targets)]
-    anchored = [pool[p] for p in _uniform(len(pool), anchors)]
+    anchored = [pool[p] for p in _uniform(len(pool), min(anchors, context))]
     rest = [i for i in pool if i not in set(anchored)]
     chosen = anchored + _first(rest, context - len(anchored), num_frames, f"without {len(chosen_targets)} targets")
     return Split(protocol="paper", context=tuple(chosen), targets=tuple(chosen_targets))

@@ -57,8 +57,7 @@ class StreamFrame:
     @staticmethod
     def from_dict(fields: dict[str, Any]) -> "StreamFrame":
         """The stream frame of the fields that `to_dict` gave."""
-        rotation, origin = np.array(fields["rotation"]), np.array(fields["origin"])
-        return StreamFrame(rotation, origin, fields["scale"], fields["near"], fields["far"], fields["warning"])
+        return StreamFrame(**fields | {name: np.array(fields[name]) for name in ("rotation", "origin")})
 
     def points_to_stream(self, points: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
         """Transforms points from the capture frame to the stream frame."""

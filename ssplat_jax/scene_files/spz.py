@@ -174,18 +174,12 @@ def _joined_frames(data: bytes, table: int, sizes: list[int]) -> bytes:
         frame, place = data[place : place + length], place + length
         if size != wanted or len(frame) < length:
             raise ValueError(f"field {i}: wanted {wanted} bytes, got {size}; it is damaged or cut off")
-        body.append(_decompressed(frame, size) if length else b"")
+        if size and zstandard.get_frame_parameters(frame).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise ValueError(f"field {i}: a frame of another size than the table says")  # before it is allocated
+        body.append(zstandard.ZstdDecompressor().decompress(frame, max_output_size=size) if size else b"")
+        if len(body[-1]) != size:
+            raise ValueError(f"field {i}: a frame holds {len(body[-1])} bytes, the table says {size}")
     return b"".join(body)
-
-
-def _decompressed(frame: bytes, size: int) -> bytes:
-    """The contents of a frame of zstd, which must be of a size: nothing larger is allocated."""
-    if zstandard.get_frame_parameters(frame).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-        raise ValueError("a frame of another size than the table says")
-    contents = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size)
-    if len(contents) != size:
-        raise ValueError(f"a frame holds {len(contents)} bytes, the table says {size}")
-    return contents
 
 
 def _unpack_rotations(rows: UInt8[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:

@@ -29,7 +29,6 @@ from ssplat_jax.data.readers.frame_list import (
     Reader,
     images_folder,
     images_in,
-    lens_remedy,
 )
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")  # places of a reconstruction, in the order of search
@@ -132,7 +131,7 @@ def _intrinsics(camera: CameraEntry) -> Intrinsics:
     names = supported.get(camera.model)
     if names is None:
         wanted = f"one of {', '.join(supported)}"
-        raise refusal(camera.where, wanted=wanted, got=echo(camera.model), fix=lens_remedy(camera.model))
+        raise refusal(camera.where, wanted=wanted, got=echo(camera.model), fix=UNDISTORT)
     if len(camera.params) != len(names):
         wanted = f"{len(names)} parameters ({' '.join(names)})"
         raise refusal(camera.where, wanted=wanted, got=str(len(camera.params)), fix=COPY_AGAIN)

@@ -32,7 +32,6 @@ from ssplat_jax.data.images import (
     image_size,
     shows_too_little,
 )
-from ssplat_jax.data.parsing import UNDISTORT
 from ssplat_jax.data.posed_image import (
     MILLIMETER,
     ROTATION_ROUNDING,
@@ -49,8 +48,6 @@ MAX_CENTER_OFFSET = 0.2  # of a side; a principal point farther from the center 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")  # that are tried behind a name
 LISTED = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})  # of images, in lower case
 MASK_SUFFIXES = (".png", "", "_mask.png", ".mask.png")  # behind the name of an image, its mask
-PANORAMAS = ("EQUIRECTANGULAR", "VR180_L", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "ORTHOPHOTO")
-CUT = "cut them into perspective views first (`ns-process-data images --camera-type equirectangular`)"
 SHRUNK_FOLDERS = ("images_2", "images_4", "images_8")  # downscaled copies of images/, which may be missing
 
 
@@ -90,11 +87,6 @@ def pinhole(matrix: Float64[np.ndarray, "_ _"], where: str, center: float = 0.0)
     check_matrices(np.eye(4), K, where)
     fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return Intrinsics(fx=fx, fy=fy, cx=cx + center, cy=cy + center)
-
-
-def lens_remedy(model: object) -> str:
-    """The remedy for images of a camera model that is not supported."""
-    return CUT if model in (*PANORAMAS, "spherical") else UNDISTORT
 
 
 class FrameList:

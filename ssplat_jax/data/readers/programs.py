@@ -22,7 +22,6 @@ from ssplat_jax.data.readers.frame_list import (
     find_file,
     images_folder,
     images_in,
-    lens_remedy,
     name_in,
     pinhole,
 )
@@ -237,7 +236,7 @@ def _calibration(sensor: ElementTree.Element | None, where: str) -> tuple[Intrin
     calibration = next((c for c in calibrations if c.get("class") == "adjusted"), calibrations[0])
     kind, size = calibration.get("type", "frame"), calibration.find("resolution")
     if kind not in ("frame", "fisheye", "equidistant_fisheye"):
-        raise refusal(where, wanted="a frame or fisheye sensor", got=kind, fix=lens_remedy(kind))
+        raise refusal(where, wanted="a frame or fisheye sensor", got=kind, fix=UNDISTORT)
     with reading(where):
         texts = {value.tag: value.text or "" for value in calibration if value.tag not in ("resolution", "covariance")}
         texts |= {} if size is None else size.attrib
@@ -245,9 +244,6 @@ def _calibration(sensor: ElementTree.Element | None, where: str) -> tuple[Intrin
     width, height = values.number("width"), values.number("height")
     lens = {ours: values.number(name, 0.0) for ours, name in XML_LENS.items()}
     values.refuse_lens("b2", "k5", "k6", "p3", "p4")  # b2 is skew
-    if kind != "frame" and (lens["p1"] or lens["p2"]):
-        got = "a fish-eye lens with p1 or p2"
-        raise refusal(where, wanted="p1 and p2 for frame cameras alone", got=got, fix=UNDISTORT)
     cx, cy = width / 2 + values.number("cx", 0.0), height / 2 + values.number("cy", 0.0)
     f, model = values.number("f"), Lens if kind == "frame" else FisheyeLens
     return Intrinsics(f + values.number("b1", 0.0), f, cx, cy, model(**lens)), where, (width, height)

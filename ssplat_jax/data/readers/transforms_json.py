@@ -29,7 +29,6 @@ from ssplat_jax.data.readers.frame_list import (
     Reader,
     file_named,
     in_images,
-    lens_remedy,
     stored_size,
 )
 from ssplat_jax.data.readers.programs import SPLAT_CAMERAS
@@ -136,12 +135,13 @@ def _lens(fields: Fields, own: Fields) -> Lens:
 
     A list of the file gives way to coefficients that the frame has of its own.
     """
-    model, flag, where = fields.get("camera_model"), fields.get("is_fisheye"), f"{fields.where}: camera_model"
+    model, flag = fields.get("camera_model"), fields.get("is_fisheye")
     if flag not in (None, True, False):
         raise refusal(f"{fields.where}.is_fisheye", wanted="true or false", got=echo(flag), fix="write a JSON boolean")
     is_fisheye = model in FISHEYE_MODELS or bool(flag)
     if not is_fisheye and model not in PINHOLE_MODELS:
-        raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=lens_remedy(model))
+        wanted = "OPENCV, PINHOLE or OPENCV_FISHEYE"
+        raise refusal(f"{fields.where}: camera_model", wanted=wanted, got=echo(model), fix=UNDISTORT)
     has_own = own.get("distortion_params") is None and any(own.get(name) is not None for name in COEFFICIENTS)
     if has_own or fields.get("distortion_params") is None:
         coefficients = {name: fields.number(name, 0.0) for name in COEFFICIENTS}
@@ -150,9 +150,6 @@ def _lens(fields: Fields, own: Fields) -> Lens:
     if model == "FULL_OPENCV":
         coefficients |= {"d1": coefficients.pop("k4"), "d2": fields.number("k5", 0.0), "d3": fields.number("k6", 0.0)}
     fields.refuse_lens(*UNKNOWN_LENS[2 * (model == "FULL_OPENCV") :])
-    if is_fisheye and (coefficients["p1"] or coefficients["p2"]):
-        got = "p1 or p2 beside them"
-        raise refusal(where, wanted="a fish-eye lens with k1 to k4 alone", got=got, fix=UNDISTORT)
     return FisheyeLens(**coefficients) if is_fisheye else Lens(**coefficients)
 
 
