@@ -159,8 +159,7 @@ def check_intrinsics(
 
 Axes = Literal["opencv", "opengl"]
 """Axes of a camera: +y down and +z forward (opencv), or +y up and +z backward (opengl)."""
-Direction = Literal["camera-to-world", "world-to-camera"]
-"""Direction of the matrices or vectors that a file gives."""
+Direction = Literal["camera-to-world", "world-to-camera"]  # direction of the matrices or vectors that a file gives
 
 
 @dataclasses.dataclass(frozen=True)

@@ -73,8 +73,7 @@ class CommonPoints:
     close: Float64[np.ndarray, " m"]  # inverse depths of points with sufficient parallax from the nearest partner
 
 
-KeypointsOf = Callable[[int], Keypoints]
-"""Function that returns the keypoints of a frame."""
+KeypointsOf = Callable[[int], Keypoints]  # function that returns the keypoints of a frame
 
 
 def detect_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:

@@ -45,11 +45,6 @@ class Split:
     context: tuple[int, ...]  # in the order of streaming
     targets: tuple[int, ...]
 
-    def __post_init__(self) -> None:
-        used = self.context + self.targets
-        if len(set(used)) != len(used):
-            raise ValueError("a frame occurs twice in the split.")
-
     @property
     def keeps_order(self) -> bool:
         """True if chunks take the context in its order, without interleaving."""
@@ -204,8 +199,7 @@ def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chun
 
 # -- index files ------------------------------------------------------------------------------------------------------
 
-Index = dict[str, Split | None]
-"""The split of each scene; None for a scene that is left out."""
+Index = dict[str, Split | None]  # the split of each scene; None for a scene that is left out
 
 
 def read_index(path: Path) -> tuple[Index, tuple[str, ...]]:

@@ -71,8 +71,6 @@ def adjust_poses(
     """
     used = list(range(len(capture)) if indices is None else indices)
     stays = AdjustedPoses(capture, 0.0, 0.0, 0.0, 0.0, 0)
-    if len(used) < 2:
-        return stays
     depth = estimate_depths(capture, used).median
     seen = find_tracks(capture, used, depth, advance)
     if seen.num_points < MIN_TRACKS:

@@ -38,22 +38,14 @@ def _read_scannet(path: Path, convention: Convention) -> Listing:
     """The tracked frames."""
     frames = FrameList(path, convention)
     file = file_named(frames.root, "intrinsic/intrinsic_color.txt", f"{path}: intrinsics")
-    intrinsics, images = pinhole(_matrix(file), str(file)), images_in(frames.root / "color")
+    intrinsics, images = pinhole(load_rows(file, 4), str(file)), images_in(frames.root / "color")
     for image in images:
         pose_file = find_file(frames.root, [f"pose/{image.stem}.txt"], str(image))
-        if pose_file is not None and np.isfinite(matrix := _matrix(pose_file)).all():
+        if pose_file is not None and np.isfinite(matrix := load_rows(pose_file, 4)).all():
             depth = find_file(frames.root, [f"depth/{image.stem}.png"], str(image))
             name, where = f"color/{image.name}", f"{pose_file}, {file}"
             frames.add(name, image, matrix, intrinsics, where, key=image.stem, depth=depth)
     return frames.listing(len(images), "finite pose")
-
-
-def _matrix(file: Path) -> Float64[np.ndarray, "4 4"]:
-    """Reads a 4x4 matrix."""
-    rows = load_rows(file, 4)
-    if rows.shape != (4, 4):
-        raise refusal(str(file), wanted="four rows of four numbers", got=f"{len(rows)} rows", fix="export it again")
-    return rows
 
 
 SCANNET = Reader("ScanNet", lambda path: (path / "color").is_dir() and (path / "pose").is_dir(), _read_scannet)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from ssplat_jax.core.cameras import check_matrices
-from ssplat_jax.core.errors import echo, refusal
+from ssplat_jax.core.errors import echo, reading, refusal
 from ssplat_jax.data.images import (
     IGNORED_PX,
     PINHOLE,
@@ -83,7 +83,8 @@ class Intrinsics:
 
 def pinhole(matrix: Float64[np.ndarray, "_ _"], where: str, center: float = 0.0) -> Intrinsics:
     """Intrinsics of a matrix, refused if it has skew; `center` is what the first pixel's center lacks to (0.5, 0.5)."""
-    K = np.array(matrix[:3, :3], np.float64)
+    with reading(where):
+        K = np.array(matrix[:3, :3], np.float64).reshape(3, 3)
     check_matrices(np.eye(4), K, where)
     fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return Intrinsics(fx=fx, fy=fy, cx=cx + center, cy=cy + center)
