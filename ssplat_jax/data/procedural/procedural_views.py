@@ -143,7 +143,8 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
     it saw before, and hardly moves. Another `seed` selects another world of the same kind.
     """
     if name not in CAPTURES:
-        raise InputError(f"procedural:{name}: no such capture; there is {', '.join(CAPTURES)}.")
+        options = "with the options ?frames=73&size=128x96&seed=0&depth=on"
+        raise InputError(f"procedural:{name}: no such capture; there is {', '.join(CAPTURES)}, {options}.")
     route = _ROUTES[name]
     rng = np.random.default_rng([4, route.first_seed + seed])
     while True:
