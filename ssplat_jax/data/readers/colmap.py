@@ -16,7 +16,7 @@ import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 from ssplat_jax.core.errors import InputError, echo, reading, refusal
 from ssplat_jax.data.images import FisheyeLens, Lens
@@ -152,7 +152,7 @@ def _load(model: Path) -> tuple[dict[int, CameraEntry], list[ImageEntry]]:
     return _text_cameras(model / "cameras.txt"), _text_images(model / "images.txt")
 
 
-def _take(file: BinaryIO, layout: str) -> tuple:
+def _take(file: io.BytesIO, layout: str) -> tuple:
     """The next little-endian values of a `struct` layout, which raises at the end of the file."""
     return struct.unpack("<" + layout, file.read(struct.calcsize("<" + layout)))
 
