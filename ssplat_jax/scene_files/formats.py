@@ -21,6 +21,7 @@ from ssplat_jax.scene_files.spz import RUB, decode_spz, encode_spz
 FilePath = str | os.PathLike
 Offset = tuple[float, float, float]
 ORIGIN: Offset = (0.0, 0.0, 0.0)
+RETRY = "check the path, or write the file again"
 # By the end of the file's name. A .ply may be a compressed one, whatever its name.
 WRITERS: dict[str, Callable[..., bytes]] = {".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog}
 WRITERS |= {".glb": encode_glb, ".splat": encode_splat}
@@ -131,5 +132,5 @@ def load_ply(path: FilePath) -> Gaussians:
 
 
 def _read(path: FilePath, suffix: str) -> Gaussians:
-    with reading(f"{path} as a {suffix}"), np.errstate(all="ignore"):  # NaNs are refused by what they mean
+    with reading(f"{path} as a {suffix}", RETRY), np.errstate(all="ignore"):  # NaNs are refused by what they mean
         return gaussians_of_rows(SCENE_READERS[suffix](Path(path).read_bytes()))
