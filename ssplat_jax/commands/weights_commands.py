@@ -139,6 +139,8 @@ class Train:
         given, held = load_weights(self.init_weights)
         given = {name: stage for name, stage in given.items() if stage and name not in recipe.untrained}
         config = apply_changes(preset(self.preset) if self.preset else held, self.set)
+        if self.preset and (changes := _differences(held, config)):
+            reporter.say(f"--preset {self.preset} changes the configuration of {self.init_weights}: {changes}")
         params = complete_params(jax.random.key(self.seed), config, given)
         check_params(params, config, str(self.init_weights))
         if unused := [name for name in given if not params.get(name)]:
@@ -146,6 +148,15 @@ class Train:
         if fresh := [name for name, stage in params.items() if stage and name not in given]:
             reporter.say(f"{self.init_weights} gives no {', '.join(fresh)}: random at the start")
         return config, given, params
+
+
+def _differences(held: StreamConfig, config: StreamConfig) -> str:
+    """The fields whose values differ, with both; of another network, its kind alone."""
+    if held.network.kind != config.network.kind:
+        return f"network {held.network.kind} -> {config.network.kind}"
+    names = [f"{group}.{field.name}" for group in held.groups() for field in dataclasses.fields(getattr(held, group))]
+    pairs = [(name, held.get(name), config.get(name)) for name in names]
+    return ", ".join(f"{name} {before} -> {after}" for name, before, after in pairs if before != after)
 
 
 @dataclasses.dataclass(frozen=True)
