@@ -97,6 +97,13 @@ def compiled_plainly():
     jax.config.update("jax_disable_most_optimizations", before)
 
 
+@pytest.fixture(autouse=True)
+def folders_compiled_plainly(request):
+    """In these folders all tests are compiled plainly."""
+    if request.node.path.parent.name in ("model", "training", "commands"):
+        request.getfixturevalue("compiled_plainly")
+
+
 _session_programs: dict = collections.defaultdict(dict)
 
 

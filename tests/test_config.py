@@ -83,8 +83,6 @@ def test_short_name_that_two_groups_share_is_refused(monkeypatch):
     assert config.replace(**{"network.voxel_size": 0.5}).get("network.voxel_size") == 0.5
 
 
-def test_paper_has_no_additions_and_shared_fields_are_few():
+def test_paper_has_no_additions():
     assert preset("paper").additions == LITERAL
     assert {x for x in dataclasses.asdict(LITERAL).values() if x is not False} == {"metric"}
-    groups = (getattr(StreamConfig(), name) for name in StreamConfig().groups() if name != "network")
-    assert sum(len(dataclasses.fields(group)) for group in groups) <= 26

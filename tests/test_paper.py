@@ -15,7 +15,6 @@ from ssplat_jax.cache.project import ProjectedCache, project
 from ssplat_jax.cache.state import Tokens
 from ssplat_jax.config import preset
 from ssplat_jax.core.cameras import Camera
-from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.numerics import softplus_inverse
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
@@ -26,8 +25,8 @@ from ssplat_jax.model.streamsplat import ChunkOutput, Prediction, StreamSplat
 from ssplat_jax.model.views import DepthDistribution, Views, prepare_views
 from ssplat_jax.training import losses
 from ssplat_jax.training.recipe import RECIPES
-from ssplat_jax.training.samples import Sample
 from tests.data.capture_fixture import smooth_capture
+from tests.training.test_losses import sample_of
 
 PAPER = preset("paper")
 SLIM = PAPER.replace(token_width=8, num_depths=24, cgfi_width=8, capacity=256)
@@ -254,12 +253,8 @@ def test_training_follows_the_rendering_loss_of_all_tokens_over_black(monkeypatc
     monkeypatch.setattr(losses.DepthLoss, "of_stream", lambda *args: streamed)
     rendered = lambda self, scene, *rest: (f32(3.0), {"least": scene.opacities.min(), "most": scene.opacities.max()})  # noqa: E731
     monkeypatch.setattr(losses.RenderingLoss, "of_scene", rendered)
-    zeros = jnp.zeros
-    chunks = Chunk(
-        zeros((1, 2, 8, 8, 3)), zeros((1, 2, 4, 4)), zeros((1, 2, 3, 3)), zeros((1, 2), bool), *zeros((2, 1))
-    )
-    camera = Camera(zeros((2, 4, 4)), zeros((2, 3, 3)), 8, 8)
-    sample = Sample(chunks, zeros((1, 2, 2, 2)), zeros((2, 8, 8, 3)), camera, zeros((), bool))
+    camera = Camera(jnp.zeros((2, 4, 4)), jnp.zeros((2, 3, 3)), 8, 8)
+    sample = sample_of(jnp.zeros((1, 2, 2, 2)), jnp.zeros((2, 8, 8, 3)), camera)
     batch, params = jax.tree.map(lambda x: x[None], sample), {"decoder": HEAD}
     loss_of = lambda loss: jax.jit(lambda params: loss(MODEL, params, batch))(params)  # noqa: E731
     value, scene = loss_of(phase.loss)

@@ -8,6 +8,7 @@ import pytest
 from ssplat_jax.cache.key_views import KeyViews, camera_distances, empty_key_views, keep_views, usable
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
+from tests.model.small import side_by_side
 
 HEIGHT, WIDTH, SLOTS = 2, 3, 4
 KEEP = jax.jit(lambda ring, arrivals: keep_views(ring, arrivals, depth=2.0))
@@ -16,10 +17,9 @@ USABLE = jax.jit(usable)
 
 def views(places, first: int = 0) -> KeyViews:
     """Views from places on a line; the color of an image is its number."""
-    viewmats = np.tile(np.eye(4, dtype=np.float32), (len(places), 1, 1))
-    viewmats[:, 0, 3] = -np.asarray(places, np.float32)
+    viewmats = jnp.asarray(side_by_side(places), jnp.float32)
     images = np.arange(first, first + len(places), dtype=np.float32)[:, None, None, None] / 255
-    camera = Camera(jnp.asarray(viewmats), jnp.tile(jnp.eye(3), (len(places), 1, 1)), width=WIDTH, height=HEIGHT)
+    camera = Camera(viewmats, jnp.tile(jnp.eye(3), (len(places), 1, 1)), width=WIDTH, height=HEIGHT)
     return KeyViews.of(camera, jnp.asarray(np.broadcast_to(images, (len(places), HEIGHT, WIDTH, 3))))
 
 

@@ -1,7 +1,5 @@
 """The projection equals the NumPy reference and sees the front surface of each pixel."""
 
-import importlib
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,34 +11,22 @@ from ssplat_jax.cache.project import coarsen, project
 from ssplat_jax.cache.votes import carve, observe
 from ssplat_jax.core.pytree import replace
 from tests.cache import numpy_reference as reference
-from tests.cache.projection_scenes import (
-    DECISION_MARGIN,
-    DEPTHS,
-    SEED,
-    SETTINGS,
-    cameras,
-    cells_of,
-    front_camera,
-    random_views,
-    scene,
-    with_pivots,
-)
+from tests.cache import projection_scenes as scenes
 from tests.cache.streams import CAPACITY, CONFIG, VALUE_RTOL
 
 jit_project = jax.jit(project, static_argnums=2)
 PLAIN_MEAN = CONFIG.replace(front_cluster=False)
-MODULE = importlib.import_module("ssplat_jax.cache.project")  # the package's `project` is the function
 
 
 @pytest.mark.parametrize("config", [CONFIG, PLAIN_MEAN], ids=["cluster", "plain_mean"])
-@SETTINGS
-@given(scene_seed=SEED, camera_seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
+@scenes.SETTINGS
+@given(scene_seed=scenes.SEED, camera_seed=scenes.SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=scenes.DEPTHS)
 def test_projection_equals_the_reference(config, scene_seed, camera_seed, num_voxels, depth_spread):
-    cache, camera = scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed)
+    cache, camera = scenes.scene(scene_seed, num_voxels, depth_spread), scenes.cameras(camera_seed)
     depths, confidences, feats, mask, colors, margin = reference.project(
         reference.from_arrays(cache), camera.viewmats, camera.Ks, camera.height, camera.width, config
     )
-    assume(margin > DECISION_MARGIN)
+    assume(margin > scenes.DECISION_MARGIN)
     result = jit_project(cache, camera, config)
     for name, wanted in (("depths", depths), ("confidences", confidences), ("feats", feats), ("colors", colors)):
         scale = np.abs(wanted).max(initial=1e-30)
@@ -50,18 +36,18 @@ def test_projection_equals_the_reference(config, scene_seed, camera_seed, num_vo
 
 @pytest.mark.parametrize("z", [-2.0, 0.0, 0.005, 0.01])
 def test_a_pivot_behind_the_near_plane_is_invisible(z):
-    assert not np.any(jit_project(with_pivots([[0.0, 0.0, z]]), front_camera(), CONFIG).mask)
+    assert not np.any(jit_project(scenes.with_pivots([[0.0, 0.0, z]]), scenes.front_camera(), CONFIG).mask)
 
 
 @pytest.mark.parametrize(("place", "is_seen"), [((4.0, 0.0), True), ((8.0, 0.0), False), ((4.0, 6.0), False),
                                                 ((0.0, 3.0), True), ((4.0, -0.01), False)])  # fmt: skip
 def test_pixels_hold_their_left_and_upper_edges(place, is_seen):
     """A pivot on the right or lower border of one view must not show in the next one."""
-    one = front_camera()
+    one = scenes.front_camera()
     camera = jax.tree.map(lambda x: jnp.concatenate([x, x]), one)
     K = np.asarray(one.Ks[0])
     x, y = ((place[i] - K[i, 2]) / K[i, i] * 2.0 for i in (0, 1))
-    found = np.argwhere(np.asarray(jit_project(with_pivots([[x, y, 2.0]]), camera, CONFIG).mask)).tolist()
+    found = np.argwhere(np.asarray(jit_project(scenes.with_pivots([[x, y, 2.0]]), camera, CONFIG).mask)).tolist()
     row, column = int(place[1]), int(place[0])
     assert found == ([[0, row, column], [1, row, column]] if is_seen else [])
 
@@ -72,22 +58,24 @@ def test_recentering_removes_the_bias_towards_the_camera():
     for _ in range(60):
         depths = 2.0 * np.exp(0.05 * rng.normal(size=CAPACITY))
         means = np.stack([np.zeros(CAPACITY), np.zeros(CAPACITY), depths], axis=-1)
-        biases.append(float(jit_project(with_pivots(means), front_camera(), CONFIG).depths[0, 3, 4]) / 2.0 - 1.0)
+        biases.append(
+            float(jit_project(scenes.with_pivots(means), scenes.front_camera(), CONFIG).depths[0, 3, 4]) / 2.0 - 1.0
+        )
     assert abs(np.mean(biases)) < 0.005  # -2 % without re-centering; 60 x 16 samples give +-0.2 %
 
 
 def test_no_gradient_passes_the_projection():
     def loss(means, viewmats):
-        camera = replace(cameras(1), viewmats=viewmats)
-        result = project(replace(scene(2, CAPACITY, 1.0), means=means), camera, CONFIG)
+        camera = replace(scenes.cameras(1), viewmats=viewmats)
+        result = project(replace(scenes.scene(2, CAPACITY, 1.0), means=means), camera, CONFIG)
         return jnp.sum(result.depths) + jnp.sum(result.feats)
 
-    grads = jax.jit(jax.grad(loss, argnums=(0, 1)))(scene(2, CAPACITY, 1.0).means, cameras(1).viewmats)
+    grads = jax.jit(jax.grad(loss, argnums=(0, 1)))(scenes.scene(2, CAPACITY, 1.0).means, scenes.cameras(1).viewmats)
     assert not any(np.any(np.asarray(g)) for g in grads)
 
 
 def test_a_coarse_cell_equals_its_nearest_fine_cell():
-    fine = jit_project(scene(5, CAPACITY, 0.3), cameras(6), CONFIG)
+    fine = jit_project(scenes.scene(5, CAPACITY, 0.3), scenes.cameras(6), CONFIG)
     assert coarsen(fine, 1) is fine
     coarse = jax.jit(coarsen, static_argnums=1)(fine, 2)
     mask, depths = np.asarray(fine.mask), np.asarray(fine.depths)
@@ -107,8 +95,8 @@ def test_a_coarse_cell_equals_its_nearest_fine_cell():
 
 def test_the_size_of_blocks_changes_nothing(monkeypatch):
     """Blocks so small that rows and pairs take many of them, the last one partly empty."""
-    cache, camera = scene(7, CAPACITY - 3, 0.1), cameras(8)
-    cells = cells_of(*random_views(8))
+    cache, camera = scenes.scene(7, CAPACITY - 3, 0.1), scenes.cameras(8)
+    cells = scenes.cells_of(*scenes.random_views(8))
 
     def passes(cache):
         carved = carve(cache, camera, cells, CONFIG).confidences
@@ -117,7 +105,7 @@ def test_the_size_of_blocks_changes_nothing(monkeypatch):
 
     whole = jax.jit(passes)(cache)
     assert np.any(whole[1] != cache.confidences) and np.any(whole[2] != 0)
-    monkeypatch.setattr(MODULE, "ROWS_PER_BLOCK", 4)
-    monkeypatch.setattr(MODULE, "PAIRS_PER_BLOCK", 7)
+    monkeypatch.setattr("ssplat_jax.cache.project.ROWS_PER_BLOCK", 4)
+    monkeypatch.setattr("ssplat_jax.cache.project.PAIRS_PER_BLOCK", 7)
     blocks = jax.jit(lambda cache: passes(cache))(cache)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=VALUE_RTOL, atol=4 * VALUE_RTOL), blocks, whole)

@@ -12,24 +12,11 @@ from ssplat_jax.cache.votes import carve, observation_features, observe, store_d
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
 from tests.cache import numpy_reference as reference
-from tests.cache.projection_scenes import (
-    DECISION_MARGIN,
-    DEPTHS,
-    GRID_WIDTH,
-    HEIGHT,
-    SEED,
-    SETTINGS,
-    cameras,
-    cells_of,
-    front_camera,
-    random_views,
-    scene,
-    with_pivots,
-)
+from tests.cache import projection_scenes as scenes
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax, tokens_at
 
 EMPTY = init_cache(CONFIG, CAPACITY)
-SHAPE = (1, HEIGHT, GRID_WIDTH)
+SHAPE = (1, scenes.HEIGHT, scenes.GRID_WIDTH)
 TAU = float(np.float32(CONFIG.memory.min_confidence))
 jit_vote = jax.jit(vote, static_argnums=2)
 
@@ -42,7 +29,7 @@ def told(cache, camera, cells):
 
 def seen(depth: float, confidence: float = 0.8, color: float = 0.5):
     """Cells of the front camera, all alike."""
-    return cells_of(jnp.full(SHAPE, depth), jnp.full(SHAPE, confidence), jnp.full((*SHAPE, 3), color))
+    return scenes.cells_of(jnp.full(SHAPE, depth), jnp.full(SHAPE, confidence), jnp.full((*SHAPE, 3), color))
 
 
 @jax.jit
@@ -54,36 +41,38 @@ def after_chunk(cache, camera, cells):
 
 def confidence_after(pivot_depth: float, *views, start: float = 0.6) -> float:
     """Confidence of one pivot on the axis of the front camera after `views`."""
-    cache = with_pivots([[0.0, 0.0, pivot_depth]], confidences=[start])
+    cache = scenes.with_pivots([[0.0, 0.0, pivot_depth]], confidences=[start])
     for cells in views:
-        cache, _ = told(cache, front_camera(), cells)
+        cache, _ = told(cache, scenes.front_camera(), cells)
     return float(cache.confidences[0, 0])
 
 
 def voted(mean, cells=None, confidence=0.6, valid=True) -> float:
     """Confidence of a token after one chunk whose view saw a wall, at depth 2 by default."""
-    cache = after_chunk(EMPTY, front_camera(), cells or seen(2.0))
+    cache = after_chunk(EMPTY, scenes.front_camera(), cells or seen(2.0))
     token = tokens_at([mean], [confidence], valid=[valid])
     return float(jit_vote(cache.stored_depths, token, CONFIG).confidences[0])
 
 
 def random_scene(seed: int, num_voxels: int = CAPACITY, depth_spread: float = 1.0):
     """A cache whose pivots have random footprints, and depths, confidences and colors of two views."""
-    cache, rng = scene(seed, num_voxels, depth_spread), np.random.default_rng(seed + 1)
+    cache, rng = scenes.scene(seed, num_voxels, depth_spread), np.random.default_rng(seed + 1)
     sizes = jnp.asarray(rng.uniform(0.05, 0.5, cache.footprints.shape), jnp.float32)
-    depths, confidences = random_views(seed)
+    depths, confidences = scenes.random_views(seed)
     colors = rng.uniform(size=(*depths.shape, 3)).astype(np.float32)
     return replace(cache, footprints=jnp.where(cache.alive, sizes, 0.0)), (depths, confidences, colors)
 
 
-@SETTINGS
-@given(seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
+@scenes.SETTINGS
+@given(seed=scenes.SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=scenes.DEPTHS)
 def test_votes_on_pivots_and_observations_equal_the_reference(seed, num_voxels, depth_spread):
-    (cache, views), camera = random_scene(seed, num_voxels, depth_spread), cameras(seed)
+    (cache, views), camera = random_scene(seed, num_voxels, depth_spread), scenes.cameras(seed)
     carved, observed = reference.from_arrays(cache), reference.from_arrays(cache)
     margin = reference.carve(carved, camera.viewmats, camera.Ks, *views[:2], CONFIG)
-    assume(min(margin, reference.observe(observed, camera.viewmats, camera.Ks, *views, CONFIG)) > DECISION_MARGIN)
-    by_votes, by_views = told(cache, camera, cells_of(*views))
+    assume(
+        min(margin, reference.observe(observed, camera.viewmats, camera.Ks, *views, CONFIG)) > scenes.DECISION_MARGIN
+    )
+    by_votes, by_views = told(cache, camera, scenes.cells_of(*views))
     for row, ((_, voted_on), (_, pivots)) in enumerate(zip(carved["rows"], observed["rows"], strict=True)):
         expected = [pivot["confidences"] for pivot in voted_on]
         np.testing.assert_allclose(by_votes.confidences[row, : len(pivots)], expected, rtol=2e-6)
@@ -94,17 +83,17 @@ def test_votes_on_pivots_and_observations_equal_the_reference(seed, num_voxels, 
     assert not np.asarray(by_views.observations)[~np.asarray(cache.alive)].any()
 
 
-@settings(SETTINGS, max_examples=6)  # two chunks each, also in the slow reference
-@given(seed=SEED, camera_seed=SEED, size=st.sampled_from([(HEIGHT, GRID_WIDTH), (40, 33)]))
+@settings(scenes.SETTINGS, max_examples=6)  # two chunks each, also in the slow reference
+@given(seed=scenes.SEED, camera_seed=scenes.SEED, size=st.sampled_from([(scenes.HEIGHT, scenes.GRID_WIDTH), (40, 33)]))
 def test_votes_on_tokens_equal_the_reference(seed, camera_seed, size):
     height, width = size
     cache, views, rng = EMPTY, [], np.random.default_rng(seed)
     for chunk in range(2):
-        camera = cameras(camera_seed + chunk)
-        scale = jnp.array([width / GRID_WIDTH, height / HEIGHT, 1.0])[:, None]
+        camera = scenes.cameras(camera_seed + chunk)
+        scale = jnp.array([width / scenes.GRID_WIDTH, height / scenes.HEIGHT, 1.0])[:, None]
         camera = Camera(viewmats=camera.viewmats, Ks=camera.Ks * scale, width=width, height=height)
-        depths, confidences = random_views(seed + chunk, height, width)
-        cache = after_chunk(cache, camera, cells_of(depths, confidences))
+        depths, confidences = scenes.random_views(seed + chunk, height, width)
+        cache = after_chunk(cache, camera, scenes.cells_of(depths, confidences))
         views.append(reference.stored_depths(camera.viewmats, camera.Ks, depths, confidences, STORED_CELLS, CONFIG))
         viewmat, K, nearest, _, weights = views[-1]
         stored = jax.tree.map(lambda x, chunk=chunk: x[chunk], cache.stored_depths)
@@ -117,7 +106,7 @@ def test_votes_on_tokens_equal_the_reference(seed, camera_seed, size):
     )
     arrays = {name: np.asarray(getattr(tokens, name)) for name in ("means", "confidences", "valid")}
     wanted, margin = reference.vote(views, arrays, CONFIG)
-    assume(margin > DECISION_MARGIN / 4)  # smaller than elsewhere: 400 pairs hardly ever keep the full margin
+    assume(margin > scenes.DECISION_MARGIN / 4)  # smaller than elsewhere: 400 pairs hardly ever keep the full margin
     got = jit_vote(cache.stored_depths, tokens, CONFIG)
     np.testing.assert_allclose(got.confidences, wanted, rtol=2e-5)
     jax.tree.map(np.testing.assert_array_equal, replace(got, confidences=tokens.confidences), tokens)
@@ -132,7 +121,7 @@ def test_confidences_stay_revisable():
 
 def test_an_untrusted_neighbor_forbids_carving_but_not_agreement():
     for row, column in ((2, 3), (3, 5), (4, 4)):
-        cells = cells_of(jnp.full(SHAPE, 2.0), jnp.full(SHAPE, 0.8).at[0, row, column].set(0.1))
+        cells = scenes.cells_of(jnp.full(SHAPE, 2.0), jnp.full(SHAPE, 0.8).at[0, row, column].set(0.1))
         assert confidence_after(1.0, cells) == np.float32(0.6)
         assert confidence_after(2.0, cells) > 0.6
 
@@ -175,15 +164,15 @@ def test_hard_votes_on_a_pivot_and_a_token_at_depth_1(confidence, depth, weight,
 
 def test_the_best_view_is_stored_and_the_oldest_chunk_replaced(monkeypatch):
     monkeypatch.setattr("ssplat_jax.cache.state.NUM_STORED", 2)
-    cache, camera = init_cache(CONFIG, CAPACITY), cameras(3)
+    cache, camera = init_cache(CONFIG, CAPACITY), scenes.cameras(3)
     for chunk in range(3):
-        depths = np.full((2, HEIGHT, GRID_WIDTH), 2.0 + chunk, np.float32)
+        depths = np.full((2, scenes.HEIGHT, scenes.GRID_WIDTH), 2.0 + chunk, np.float32)
         confidences = np.full_like(depths, 0.8)
         confidences[1 - chunk % 2, 0, 0] = 0.0  # so that the other view has one trusted cell more
-        cache = after_chunk(cache, camera, cells_of(depths, confidences))
+        cache = after_chunk(cache, camera, scenes.cells_of(depths, confidences))
         np.testing.assert_array_equal(cache.stored_depths.viewmats[chunk % 2], camera.viewmats[chunk % 2])
     np.testing.assert_allclose(np.exp(cache.stored_depths.log_depths.max(axis=(1, 2))), [4.0, 3.0], rtol=1e-6)
-    after = after_chunk(cache, front_camera(), seen(3.0, 0.0))  # as padding: it displaces nothing
+    after = after_chunk(cache, scenes.front_camera(), seen(3.0, 0.0))  # as padding: it displaces nothing
     jax.tree.map(np.testing.assert_array_equal, after.stored_depths, cache.stored_depths)
 
 
@@ -191,9 +180,9 @@ def test_without_carving_nothing_is_computed():
     off = CONFIG.replace(carving=False)
     cache, token = init_cache(off, CAPACITY), tokens_at([[0, 0, 1.0]], [0.6])
     assert cache.stored_depths.weights.size == 0
-    assert not jax.make_jaxpr(lambda *args: carve(*args, off))(cache, front_camera(), seen(2.0)).eqns
+    assert not jax.make_jaxpr(lambda *args: carve(*args, off))(cache, scenes.front_camera(), seen(2.0)).eqns
     assert not jax.make_jaxpr(lambda *args: vote(*args, off))(cache.stored_depths, token).eqns
-    assert not jax.make_jaxpr(store_depths)(cache, front_camera(), seen(2.0)).eqns
+    assert not jax.make_jaxpr(store_depths)(cache, scenes.front_camera(), seen(2.0)).eqns
 
 
 # Observations ---------------------------------------------------------------------------------------------------------
@@ -201,8 +190,8 @@ def test_without_carving_nothing_is_computed():
 
 def test_shards_see_what_the_whole_cache_sees():
     """Pivots of other shards crowd a cell too."""
-    (whole, views), camera = random_scene(0, depth_spread=0.1), cameras(0)
-    cells, half = cells_of(*views), CAPACITY // 2
+    (whole, views), camera = random_scene(0, depth_spread=0.1), scenes.cameras(0)
+    cells, half = scenes.cells_of(*views), CAPACITY // 2
     rolled = [jax.tree.map(lambda x, i=i: np.roll(x, -i * half, axis=0) if x.ndim else x, whole) for i in range(2)]
     parts = [
         replace(

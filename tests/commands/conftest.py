@@ -1,4 +1,4 @@
-"""Programs here are few (`programs_shared`), and compiled without LLVM's optimizations (`compiled_plainly`)."""
+"""Programs here are few (`programs_shared`)."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from tests.commands.command_fixture import narrow_options
 
 
 @pytest.fixture(autouse=True)
-def _few_programs(compiled_plainly, programs_shared):
+def _few_programs(programs_shared):
     pass
 
 

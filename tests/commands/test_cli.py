@@ -75,41 +75,24 @@ def test_results_among_the_captures_own_images_are_refused(tmp_path, capsys):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
-USAGES = {
-    "Expected one of {demo": (),
-    "run": ("rnu",),
-    "CAPTURE": ("run",),
-    "--size": ("run", "x", "--out", "y", "--szie", "3"),
-}
-
-
-@pytest.mark.parametrize(("named", "arguments"), USAGES.items())
-def test_usage_that_does_not_parse_is_short_and_exit_2(arguments, named, capsys):
-    assert run(*arguments) == 2
-    told = capsys.readouterr().err
-    assert named in told and len(told.splitlines()) < 14
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (("inspect", "no/such/folder"), "no/such/folder"),
         (("eval", "procedural:room", "--context", "5", "--size", "huge", "--out", "x"), "--size"),
         (("eval", "procedural:room", "--context", "8", "--set", "voxel_size=-1", "--out", "x"), "voxel_size"),
-        (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),
         (("train", "--shares", "0.5", "--out", "x"), "--shares: wanted --captures"),
-        (("bench", "effects", "--large"), "--large: benchmark effects has no use for it"),
         (("run", "procedural:room?frames=2&size=32x24", "--stride", "0", "--out", "x"), "--stride"),
         (("export", "no_run", "--to", "x.ply"), "no_run"),
         (("import-weights", "no.pth", "--out", "x.npz"), "no.pth: cannot be read"),
         (("run", "procedural:room", "--weights", "small", "--out", "x"), "none ship with the preset 'small'"),
         (("run", "x", "--out", "y", "--set", "a=1", "--adjust-poses", "--set", "b=2"), "wanted --set once, got it"),
         (("run", "procedural:room", "--causal", "--adjust-poses", "--out", "x"), "--adjust-poses: wanted a stream"),
-        (("train", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
-        (("run", "x", "--out", "y", "--port", "8090"), "--view"),
-        (("run", "x", "--out", "y", "--quiet-seconds", "3"), "--watch beside it"),
         (("poses", ".", "--frames", "20", "--out", "x"), "--frames: wanted a video"),
-        (("eval", ROOM, "--refine", "-1", "--out", "x"), "--refine: wanted a number from 0"),
+        (("run", ".", "--watch", "--quiet-seconds", "0.1", "--quiet", "--out", "x"), "a frame that can be read"),
+        (("run", ".", "--watch", "--axes", "opencv", "--out", "x"), "--watch: wanted transforms"),
+        (("eval", ROOM, "--scene", "a", "--out", "x"), "--index beside it"),
+        (("eval", ROOM, "--index", "i.json", "--context", "4", "--out", "x"), "--context too"),
     ],
 )
 def test_bad_values_are_one_line_and_exit_2(arguments, named, capsys, tmp_path, monkeypatch):
@@ -132,16 +115,6 @@ def test_files_of_a_run_are_not_replaced_by_other_commands(arguments, tmp_path, 
     assert run(*arguments, "--out", "out") == 2
     assert "wanted a folder without a run" in capsys.readouterr().err
     assert [file.read_text() for file in Path("out").iterdir()] == ["of a run"]
-
-
-def test_inspect_prints_facts_with_their_units(capsys):
-    capture = "procedural:orbit?frames=3&size=32x24"
-    assert run("inspect", capture) == 0
-    facts = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
-    assert facts["far"].endswith(" stream units (capture units times scene_scale)")
-    assert facts["median_depth"].endswith(" capture units") and facts["num_depth_maps"].split()[1] == "3"
-    assert run("inspect", capture, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["num_frames"] == 3
 
 
 def test_set_takes_what_the_field_holds():

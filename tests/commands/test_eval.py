@@ -6,7 +6,6 @@ import json
 import pytest
 from PIL import Image
 
-from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import choose_split, index_to_json, read_index
 from ssplat_jax.evaluation import cost
 from ssplat_jax.runs import evaluate_run
@@ -19,25 +18,6 @@ from tests.streaming.narrow_model import FEW_GAUSSIANS
 @pytest.fixture(autouse=True)
 def timed_once(monkeypatch):
     monkeypatch.setattr(cost, "NUM_REPEATS", 1)
-
-
-@pytest.mark.slow
-def test_an_index_sets_the_order_of_the_stream(tmp_path, narrow, monkeypatch):
-    order = []
-    views = Capture._views
-
-    def watched(self, group, *rest):
-        order.append(list(group))
-        return views(self, group, *rest)
-
-    monkeypatch.setattr(Capture, "_views", watched)
-    capture, out = make_capture(tmp_path / "capture", num_frames=9, size=SIZE), tmp_path / "out"
-    index = tmp_path / "index.json"
-    index.write_text(json.dumps({"own name": {"context": [8, 0, 4, 2, 6], "target": [3]}}))
-    arguments = ("eval", str(capture), "--index", str(index), "--scene", "own name", "--out", str(out))
-    assert run(*arguments, *narrow, "--set", "chunk_step=10.0") == 0  # a step that would interleave everything
-    assert order == [[8, 0, 4, 2], [6]]
-    assert read(out / "index.json") == read(index)
 
 
 def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow, monkeypatch):
@@ -79,24 +59,6 @@ def test_a_folder_of_scenes_without_an_index_gets_one_by_the_protocol(tmp_path):
     (tmp_path / "index.json").write_text(json.dumps(index_to_json(index)))
     again, _ = read_index(tmp_path / "index.json")
     assert index_to_json(again) == index_to_json(index)
-
-
-CONTRADICTIONS = {
-    "--context too": ("--index", "index.json", "--context", "4"),
-    "'capture'": ("--index", "index.json"),
-    "--index beside it": ("--scene", "a"),
-    "64 targets": ("--protocol", "scannet"),
-}
-
-
-@pytest.mark.parametrize(("words", "options"), CONTRADICTIONS.items())
-def test_contradictory_frames_are_bad_usage(options, words, tmp_path, narrow, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    capture, out = make_capture(tmp_path / "capture", num_frames=7, size=SIZE), tmp_path / "out"
-    (tmp_path / "index.json").write_text('{"a": {"context": [0], "target": [1]}}')
-    assert run("eval", str(capture), "--out", str(out), *options, *narrow) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line.replace('"', "'") and not out.exists()
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from ssplat_jax.runs import capture_run
 from ssplat_jax.runs.capture_run import GrowingCapture
 from ssplat_jax.runs.stream_commands import Run
 from ssplat_jax.storage.files import write_json
-from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.command_fixture import SIZE, edit, make_capture, read, run
 
 
@@ -116,17 +115,6 @@ def test_a_frame_beyond_those_asked_for_is_not_missed(tmp_path, monkeypatch, cap
         watched.look()
         assert list(watched.chunks.__wrapped__(watched, stream, stream)) == [4, 4]
         assert words in (told := capsys.readouterr().err) and bool(words) == bool(told)
-
-
-@pytest.mark.parametrize(
-    ("words", "options"),
-    [("a frame that can be read", ("--quiet-seconds", "0.1")), ("--watch: wanted transforms", ("--axes", "opencv"))],
-)
-def test_a_folder_that_cannot_be_watched_is_refused(options, words, tmp_path, narrow, capsys):
-    (tmp_path / "empty").mkdir()
-    assert run("run", tmp_path / "empty", "--out", tmp_path / "out", "--watch", *options, *narrow) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line and not RunFolder(tmp_path / "out").path.exists()
 
 
 def test_a_signal_before_the_first_chunk_ends_with_its_code(tmp_path, narrow, capsys):

@@ -1,7 +1,5 @@
 """The pages hold what they promise: commands parse, snippets run, links resolve."""
 
-import ast
-import importlib
 import re
 import shlex
 import subprocess
@@ -56,23 +54,6 @@ def test_commands_parse(page, monkeypatch):
             assert {flag.removeprefix("--") for flag in flags} <= fields, command
             continue
         assert isinstance(parse(monkeypatch, arguments), command_type), command
-
-
-def resolve_imports(tree: ast.AST) -> None:
-    """Imports every import of a snippet, and looks up every attribute of `ss`."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            module = importlib.import_module(node.module)
-            for alias in node.names:
-                assert hasattr(module, alias.name), f"{node.module}.{alias.name}"
-        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "ss":
-            assert hasattr(importlib.import_module("ssplat_jax"), node.attr), f"ss.{node.attr}"
-
-
-@every_page
-def test_snippets_compile_and_their_names_resolve(page):
-    for snippet in blocks(page, "python"):
-        resolve_imports(ast.parse(snippet))
 
 
 def run_snippets(page, tmp_path, monkeypatch, is_wanted) -> int:

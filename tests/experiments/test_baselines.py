@@ -10,15 +10,14 @@ from ssplat_jax.config import preset
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
+from tests.model.small import side_by_side
 
 K = np.array([[32.0, 0.0, 16.0], [0.0, 32.0, 12.0], [0.0, 0.0, 1.0]], np.float32)
 
 
 def camera(x=0.0):
     """A camera that stands at x and looks along +z."""
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[0, 3] = -x
-    return Camera(viewmats=jnp.asarray(viewmat), Ks=jnp.asarray(K), width=32, height=24)
+    return Camera(viewmats=jnp.asarray(side_by_side([x])[0], jnp.float32), Ks=jnp.asarray(K), width=32, height=24)
 
 
 def test_a_wall_is_warped_by_its_disparity():

@@ -10,14 +10,7 @@ import pytest
 from ssplat_jax.cache.state import NUM_OBSERVED, init_cache
 from ssplat_jax.config import preset
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.decoder import (
-    MAX_LOG_CONTRAST,
-    MAX_LOGIT_CHANGE,
-    Evidence,
-    apply_evidence,
-    divide_cells,
-    evidence_features,
-)
+from ssplat_jax.model import decoder
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import TokenShapes
@@ -35,10 +28,12 @@ def shapes(num: int = NUM) -> TokenShapes:
     )
 
 
-def evidence(value: float = 1.0, num: int = NUM) -> Evidence:
+def evidence(value: float = 1.0, num: int = NUM) -> decoder.Evidence:
     """Evidence whose fields all have one value."""
     each = jnp.full(num, value)
-    return Evidence(jnp.full((num, NUM_OBSERVED), value), each, each, each, each, each, jnp.full((num, 12), value))
+    return decoder.Evidence(
+        jnp.full((num, NUM_OBSERVED), value), each, each, each, each, each, jnp.full((num, 12), value)
+    )
 
 
 @functools.cache
@@ -51,15 +46,15 @@ def head_with(bias: float) -> dict:
     return {**untrained(), "out": {**untrained()["out"], "bias": jnp.full(4, bias)}}
 
 
-def different_colors() -> Evidence:
+def different_colors() -> decoder.Evidence:
     """Evidence of pivots whose four Gaussians differ in color."""
     return replace(evidence(), rgbs=jnp.asarray(np.random.default_rng(4).uniform(size=(NUM, 12)), jnp.float32))
 
 
 @jax.jit
-def changed(params: dict, facts: Evidence):
+def changed(params: dict, facts: decoder.Evidence):
     """Shapes and parts after the head with `params` has seen `facts`."""
-    return apply_evidence(params, shapes(), divide_cells(facts.rgbs, CONFIG), facts, CONFIG)
+    return decoder.apply_evidence(params, shapes(), decoder.divide_cells(facts.rgbs, CONFIG), facts, CONFIG)
 
 
 def cache_of_pivots(num: int = 6):
@@ -87,10 +82,10 @@ def test_changes_are_bounded_contrast_keeps_the_mean_color_and_nothing_else_move
     before = np.asarray(different_colors().rgbs, np.float64).reshape(NUM, 4, 3)
     got, parts = changed(head_with(bias), different_colors())
     after = np.asarray(parts.colors, np.float64)
-    gain = np.exp(MAX_LOG_CONTRAST * np.tanh(bias / MAX_LOG_CONTRAST))
+    gain = np.exp(decoder.MAX_LOG_CONTRAST * np.tanh(bias / decoder.MAX_LOG_CONTRAST))
     mean = before.mean(axis=1, keepdims=True)
     np.testing.assert_allclose(after, mean + gain * (before - mean), atol=1e-6)
-    moved = MAX_LOGIT_CHANGE * np.tanh(bias / MAX_LOGIT_CHANGE)
+    moved = decoder.MAX_LOGIT_CHANGE * np.tanh(bias / decoder.MAX_LOGIT_CHANGE)
     np.testing.assert_allclose(got.logit_opacities - shapes().logit_opacities, moved, rtol=1e-5)
     assert np.any(got.raw_scales != shapes().raw_scales)
     np.testing.assert_array_equal(got.quats, shapes().quats)
@@ -99,10 +94,10 @@ def test_changes_are_bounded_contrast_keeps_the_mean_color_and_nothing_else_move
 
 @jax.jit
 @functools.partial(jax.value_and_grad, has_aux=True)
-def value_and_gradient(params: dict, facts: Evidence):
+def value_and_gradient(params: dict, facts: decoder.Evidence):
     got, parts = changed(params, facts)
     loss = got.logit_opacities.sum() + got.raw_scales.sum() + parts.colors.sum()
-    return loss, evidence_features(facts, CONFIG)
+    return loss, decoder.evidence_features(facts, CONFIG)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
@@ -113,7 +108,7 @@ def test_value_and_gradient_are_finite_at_the_limits(value):
 
 
 def test_the_gradient_by_colors_is_finite_where_all_are_equal():
-    features = jax.jit(lambda rgbs: evidence_features(replace(different_colors(), rgbs=rgbs), CONFIG))
+    features = jax.jit(lambda rgbs: decoder.evidence_features(replace(different_colors(), rgbs=rgbs), CONFIG))
     rgbs = different_colors().rgbs.at[0].set(0.5)
     np.testing.assert_allclose(features(rgbs)[1:], features(different_colors().rgbs)[1:], rtol=1e-6)
     slopes = np.asarray(jax.jit(jax.grad(lambda x: features(x).sum()))(rgbs))
@@ -134,5 +129,5 @@ def test_the_scene_has_the_contrast_that_the_head_asks_for():
     mean = before.mean(axis=1, keepdims=True)
     alive = np.ptp(before, axis=(1, 2)) > 0.1
     assert alive.sum() == 6
-    gain = np.exp(MAX_LOG_CONTRAST * np.tanh(0.5 / MAX_LOG_CONTRAST))
+    gain = np.exp(decoder.MAX_LOG_CONTRAST * np.tanh(0.5 / decoder.MAX_LOG_CONTRAST))
     np.testing.assert_allclose((after - mean)[alive], gain * (before - mean)[alive], atol=2e-3)

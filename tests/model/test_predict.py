@@ -9,19 +9,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.pytree import replace
-from tests.model.small import (
-    MODEL,
-    chunk,
-    finite,
-    gradients,
-    params,
-    predict,
-    program,
-    step,
-    turned,
-    warm_cache,
-    with_gamma,
-)
+from tests.model import small
 
 SUMS = 1e-6
 
@@ -33,8 +21,8 @@ def with_images(value):
 HARD = {
     "an ordinary chunk": lambda c: c,
     "cameras at one place": lambda c: replace(c, viewmats=jnp.broadcast_to(jnp.eye(4), (3, 4, 4))),
-    "a pure rotation": lambda c: replace(c, viewmats=turned(0.2)),
-    "cameras back to back": lambda c: replace(c, viewmats=turned(np.pi)),
+    "a pure rotation": lambda c: replace(c, viewmats=small.turned(0.2)),
+    "cameras back to back": lambda c: replace(c, viewmats=small.turned(np.pi)),
     "steps of a nanometre": lambda c: replace(c, viewmats=c.viewmats.at[:, 0, 3].multiply(1e-8)),
     "cameras far apart": lambda c: replace(c, viewmats=c.viewmats.at[:, 0, 3].multiply(1e5)),
     "one camera inside the scene": lambda c: replace(c, viewmats=c.viewmats.at[1, 2, 3].set(-3.0)),
@@ -52,7 +40,7 @@ def remembering(**changes):
     """The warm cache with changed fields of its live pivots."""
 
     def change():
-        cache = warm_cache()
+        cache = small.warm_cache()
         alive = cache.alive
         fields = {}
         for name, value in changes.items():
@@ -65,7 +53,7 @@ def remembering(**changes):
 
 
 HARD_MEMORIES = {  # cache, and raw strength of the anchor
-    "empty": (MODEL.init_cache, 0.0),
+    "empty": (small.MODEL.init_cache, 0.0),
     "omega 0": (remembering(confidences=0.0), 0.0),
     "omega 1": (remembering(confidences=1.0), 0.0),
     "omega 1, gamma 1e6": (remembering(confidences=1.0), 1e6),
@@ -77,37 +65,37 @@ HARD_MEMORIES = {  # cache, and raw strength of the anchor
 }
 
 
-def check_prediction(chunk, cache, weights):
+def check_prediction(given, cache, weights):
     """Checks values, gradients, distributions and ranges of a chunk, and the cache after it."""
-    (value, (prediction, after)), gradient = program()(weights, cache, chunk)
-    assert finite((value, gradient, prediction, after))
+    (value, (prediction, after)), gradient = small.program()(weights, cache, given)
+    assert small.finite((value, gradient, prediction, after))
     probs = np.asarray(jax.nn.softmax(prediction.logits), np.float64)
     assert (probs >= 0).all()
     np.testing.assert_allclose(probs.sum(-1), 1, rtol=0, atol=SUMS)
-    span = np.log([chunk.near, chunk.far])
+    span = np.log([given.near, given.far])
     assert (prediction.log_depths >= span[0] - 1e-4).all() and (prediction.log_depths <= span[1] + 1e-4).all()
     assert ((prediction.output.confidences >= 0) & (prediction.output.confidences <= 1)).all()
 
 
 @pytest.mark.parametrize("name", HARD)
 def test_hard_chunk_gives_finite_tokens_and_gradients(name):
-    check_prediction(HARD[name](chunk()), warm_cache(), params())
+    check_prediction(HARD[name](small.chunk()), small.warm_cache(), small.params())
 
 
 @pytest.mark.parametrize("name", HARD_MEMORIES)
 def test_hard_cache_gives_finite_tokens_and_gradients(name):
     cache, raw_gamma = HARD_MEMORIES[name]
-    check_prediction(chunk(), cache(), with_gamma(raw_gamma))
+    check_prediction(small.chunk(), cache(), small.with_gamma(raw_gamma))
 
 
 def test_no_gradient_reaches_the_cache():
-    *_, remembered = gradients(warm_cache(), chunk())
+    *_, remembered = small.gradients(small.warm_cache(), small.chunk())
     for gradient in remembered:
         np.testing.assert_array_equal(gradient, 0)
 
 
 def test_every_stage_gets_a_gradient():
-    by_params, *_ = gradients(warm_cache(), chunk())
+    by_params, *_ = small.gradients(small.warm_cache(), small.chunk())
     for stage in by_params.keys() - {"evidence"}:  # it is read from the cache, not from tokens
         gradient = by_params[stage]
         assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(gradient)) > 0, stage
@@ -116,15 +104,15 @@ def test_every_stage_gets_a_gradient():
 def test_padded_view_does_not_change_the_valid_ones():
     padded = 1
     valid = jnp.ones(3, bool).at[padded].set(False)
-    base = replace(chunk(), valid=valid)
+    base = replace(small.chunk(), valid=valid)
     other = replace(
         base,
-        images=base.images.at[padded].set(chunk(5).images[0]),
-        viewmats=base.viewmats.at[padded].set(turned(0.3)[1]),
+        images=base.images.at[padded].set(small.chunk(5).images[0]),
+        viewmats=base.viewmats.at[padded].set(small.turned(0.3)[1]),
         Ks=base.Ks.at[padded, 0, 0].set(90.0),
     )
     kept = jnp.array([i for i in range(3) if i != padded])
-    a, b = (predict(params(), warm_cache(), c) for c in (base, other))
+    a, b = (small.predict(small.params(), small.warm_cache(), c) for c in (base, other))
     for name in ("depths", "confidences", "history"):
         np.testing.assert_array_equal(getattr(a.output, name)[kept], getattr(b.output, name)[kept])
     rows = np.flatnonzero(a.tokens.valid)
@@ -132,17 +120,19 @@ def test_padded_view_does_not_change_the_valid_ones():
     for name in ("means", "feats", "confidences", "rgbs", "footprints"):
         np.testing.assert_array_equal(getattr(a.tokens, name)[rows], getattr(b.tokens, name)[rows])
     # If the view is valid, the difference shows.
-    c, d = (predict(params(), warm_cache(), replace(x, valid=jnp.ones(3, bool))) for x in (base, other))
+    c, d = (
+        small.predict(small.params(), small.warm_cache(), replace(x, valid=jnp.ones(3, bool))) for x in (base, other)
+    )
     assert float(jnp.abs(c.tokens.feats[rows] - d.tokens.feats[rows]).max()) > 1e-3
 
 
 def test_a_view_that_cannot_be_used_is_padding_and_counted():
     """One bad camera once wrote NaN into the observations of pivots that other views had confirmed."""
-    spoiled = replace(chunk(), Ks=chunk().Ks.at[1, 0, 0].set(-28.0))
-    padded = replace(chunk(), valid=jnp.array([True, False, True]))
-    (after, output), (wanted, expected) = (step(params(), warm_cache(), c) for c in (spoiled, padded))
+    spoiled = replace(small.chunk(), Ks=small.chunk().Ks.at[1, 0, 0].set(-28.0))
+    padded = replace(small.chunk(), valid=jnp.array([True, False, True]))
+    (after, output), (wanted, expected) = (small.step(small.params(), small.warm_cache(), c) for c in (spoiled, padded))
     assert int(after.stats.num_unusable) == 1 and int(wanted.stats.num_unusable) == 0
     stats = replace(after.stats, num_unusable=wanted.stats.num_unusable)
     jax.tree.map(np.testing.assert_array_equal, replace(after, stats=stats), wanted)
     jax.tree.map(np.testing.assert_array_equal, output, expected)
-    assert finite(gradients(warm_cache(), spoiled))
+    assert small.finite(small.gradients(small.warm_cache(), spoiled))

@@ -21,6 +21,7 @@ from tests.model.small import CONFIG, chunk, finite, history
 
 D = 24
 WINDOW = CONFIG.replace(num_depths=D, depth_readout="window", hpda=False)
+TINY = preset("tiny")
 LOG_CANDIDATES = jnp.linspace(0.0, jnp.log(6.0), D)
 
 
@@ -104,61 +105,55 @@ def test_gradients_stay_finite_at_any_measured_depth():
             assert finite(total(jnp.zeros((3, 8, 8, D)), candidates, jnp.float32(depth)))
 
 
-def with_depths(tmp_path):
-    """A capture of which frames 0 and 2 have depth maps, of 1 and 3 meters."""
-
-    def change(root, meta):
+def test_depth_maps_of_a_capture_stream_in_stream_units_unless_they_are_left_out(tmp_path):
+    def with_depths(root, meta):  # of frames 0 and 2, at 1 and 3 meters
         for i in (0, 2):
             Image.fromarray(np.full((24, 32), 1000 * (i + 1), np.uint16)).save(root / f"d{i}.png")
             meta["frames"][i]["depth_file_path"] = f"d{i}.png"
 
-    return make_capture(tmp_path / "c", change)
-
-
-def test_depth_maps_of_a_capture_stream_in_stream_units_unless_they_are_left_out(tmp_path):
-    path, config = with_depths(tmp_path), preset("tiny").replace(chunk_size=4)
-    capture = open_capture(path)
-    stream_frame = dataclasses.replace(capture.stream_frame(config), scale=2.5)
-    first = next(iter(capture.chunks(config, [0, 1, 2, 3], stream_frame=stream_frame)))
-    assert first.depths is not None
+    path = make_capture(tmp_path / "c", with_depths)
+    capture, without = open_capture(path), open_capture(f"{path}?depth=off")
+    stream_frame = dataclasses.replace(capture.stream_frame(TINY), scale=2.5)
+    first, other = (next(iter(c.chunks(TINY, [0, 1, 2, 3], stream_frame=stream_frame))) for c in (capture, without))
     np.testing.assert_allclose([np.median(x) for x in first.depths], [2.5, 0.0, 7.5, 0.0], rtol=1e-6)
-    without = open_capture(f"{path}?depth=off")
-    assert next(iter(without.chunks(config, [0, 1, 2, 3], stream_frame=stream_frame))).depths is None
+    assert other.depths is None
     # A run is not continued with other maps.
     assert capture.files_digest(0) != without.files_digest(0)
     assert capture.files_digest(1) == without.files_digest(1)
 
 
-def test_exact_depths_of_procedural_scenes_stream_only_where_they_are_asked_for():
-    plain, exact = (open_capture(f"procedural:room?frames=12&size=64x48{end}") for end in ("", "&depth=on"))
-    config = preset("tiny")
-    assert next(iter(plain.chunks(config))).depths is None
-    stream_frame = exact.stream_frame(config)
-    first = next(iter(exact.chunks(config, range(4), stream_frame=stream_frame)))
+@pytest.fixture(scope="module")
+def exact():
+    """A capture that streams its depths, which are exact."""
+    return open_capture("procedural:room?frames=12&size=64x48&depth=on")
+
+
+def test_exact_depths_of_procedural_scenes_stream_only_where_they_are_asked_for(exact):
+    plain = open_capture("procedural:room?frames=12&size=64x48")
+    stream_frame = exact.stream_frame(TINY)
+    first, other = (next(iter(c.chunks(TINY, range(4), stream_frame=stream_frame))) for c in (exact, plain))
     np.testing.assert_allclose(first.depths, [stream_frame.scale * exact.depth(i) for i in range(4)], rtol=1e-6)
+    assert other.depths is None
     with pytest.raises(InputError, match="depth: wanted on or off"):
         open_capture("procedural:room?depth=yes")
 
 
-def test_pushed_depths_make_the_chunk_of_a_capture_that_has_them():
-    capture = open_capture("procedural:room?frames=12&size=64x48&depth=on")
-    live = LiveViews(preset("tiny"))
+def test_pushed_depths_make_the_chunk_of_a_capture_that_has_them(exact):
+    live = LiveViews(TINY)
     for i in range(4):
-        depth = capture.depth(i) if i != 1 else None
-        got = live.add(capture.image(i), capture.K(i), capture.camera(i).viewmats, depth=depth)
+        depth = exact.depth(i) if i != 1 else None
+        got = live.add(exact.image(i), exact.K(i), exact.camera(i).viewmats, depth=depth)
     assert got is not None and live.stream_frame is not None
     for v in range(4):
-        wanted = np.zeros((48, 64)) if v == 1 else live.stream_frame.scale * capture.depth(v)
+        wanted = np.zeros((48, 64)) if v == 1 else live.stream_frame.scale * exact.depth(v)
         np.testing.assert_allclose(got.depths[v], wanted, rtol=1e-5)
     with pytest.raises(InputError, match="push: depth"):
-        live.add(capture.image(0), capture.K(0), capture.camera(0).viewmats, depth=np.ones((48, 64), np.uint16))
+        live.add(exact.image(0), exact.K(0), exact.camera(0).viewmats, depth=np.ones((48, 64), np.uint16))
 
 
-def test_depth_maps_of_another_unit_than_the_poses_are_named():
-    capture = open_capture("procedural:room?frames=12&size=64x48&depth=on")
-    assert capture.stream_frame(preset("tiny")).warning is None
-    feet = dataclasses.replace(capture.pixels, depths=3.28 * capture.pixels.depths)
+def test_depth_maps_of_another_unit_than_the_poses_are_named(exact):
+    assert exact.stream_frame(TINY).warning is None
+    feet = dataclasses.replace(exact.pixels, depths=3.28 * exact.pixels.depths)
     for streams_depth, is_named in ((True, True), (False, False)):
-        other = dataclasses.replace(capture, pixels=feet, streams_depth=streams_depth)
-        warning = other.stream_frame(preset("tiny")).warning
+        warning = dataclasses.replace(exact, pixels=feet, streams_depth=streams_depth).stream_frame(TINY).warning
         assert (warning is not None and "times that of the matches" in warning) == is_named

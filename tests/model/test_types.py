@@ -13,17 +13,8 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
+from ssplat_jax.model import decoder
 from ssplat_jax.model.compact import START_OPACITY, CompactFeatures, Encoder, read_shapes, regress_tokens
-from ssplat_jax.model.decoder import (
-    MAX_SCALE,
-    MIN_DETAIL,
-    MIN_SCALE,
-    START_SCALE,
-    START_THICKNESS,
-    decode_tokens,
-    divide_cells,
-    token_scales,
-)
 from ssplat_jax.model.layers import sine_positions
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.views import (
@@ -36,12 +27,13 @@ from ssplat_jax.model.views import (
     patch_colors,
     prepare_views,
 )
-from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params, random_params
+from tests.model.small import CONFIG, HEIGHT, MODEL, WIDTH, chunk, params, random_params
 
 FLOAT32 = 1e-5
 
 
 prepared = jax.jit(lambda chunk: prepare_views(chunk, CONFIG))
+BACK_PROJECT, SOURCES = jax.jit(back_project), jax.jit(nearest_sources, static_argnums=2)
 
 
 def test_padding_keeps_the_image_and_marks_inside_cells():
@@ -112,20 +104,44 @@ def test_without_a_range_of_depths_a_chunk_is_refused_and_inside_jit_padding(nam
         check_chunk(spoiled, 3)
 
 
+def wrong(tree, **leaves):
+    """`tree` with other leaves, past the checks of a construction by hand."""
+    paths, form = jax.tree_util.tree_flatten_with_path(tree)
+    return jax.tree.unflatten(form, [leaves.get(path[-1].name, leaf) for path, leaf in paths])
+
+
+def test_a_step_and_a_run_refuse_chunks_of_other_shapes():
+    """By one error that names the array, as users get it: without the tests' own type checks."""
+    one = replace(chunk(), depths=jnp.zeros((3, *chunk().images.shape[1:3])))
+    stacked = jax.tree.map(lambda x: jnp.stack([x, x]), one)
+    check_chunk(stacked, 3, stacked=True)
+    of_a_step = {"images": one.images[:2], "viewmats": one.viewmats[:, :3], "depths": jnp.zeros((3, 8, 8))}
+    for name, leaf in (of_a_step | {"near": jnp.ones(3)}).items():
+        for call in (MODEL.step, jax.jit(MODEL.step)):
+            with pytest.raises(InputError, match=f"chunk: {name} must be"):
+                call({}, MODEL.init_cache(), wrong(one, **{name: leaf}))
+    with pytest.raises(InputError, match=r"chunk: valid must be \[t"):
+        MODEL.run({}, MODEL.init_cache(), wrong(stacked, valid=stacked.valid[:1]))
+    with pytest.raises(InputError, match=r"Chunks have 3 views \(`stream.chunk_size`\)"):
+        check_chunk(chunk(views=2), 3)
+    with pytest.raises(InputError, match=r"images must be \[t 3 h w 3\], got \[3, .*Stack chunks along a leading axis"):
+        MODEL.run({}, MODEL.init_cache(), one)
+
+
 def line_of_cameras(*xs) -> jax.Array:
     return jnp.stack([jnp.eye(4).at[0, 3].set(-float(x)) for x in xs])
 
 
 def test_sources_are_the_nearest_other_views_valid_ones_first():
-    sources, valid = nearest_sources(line_of_cameras(0, 1, 3, 7), jnp.ones(4, bool), 2)
+    sources, valid = SOURCES(line_of_cameras(0, 1, 3, 7), jnp.ones(4, bool), 2)
     np.testing.assert_array_equal(sources, [[1, 2], [0, 2], [1, 0], [2, 1]])
     assert valid.all()
-    sources, _ = nearest_sources(line_of_cameras(0, 0, 0, 0), jnp.ones(4, bool), 3)  # at one center
+    sources, _ = SOURCES(line_of_cameras(0, 0, 0, 0), jnp.ones(4, bool), 3)  # at one center
     assert [sorted(row) for row in np.asarray(sources).tolist()] == [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]
-    sources, valid = nearest_sources(line_of_cameras(0, 0.1, 5, 9), jnp.array([True, False, True, True]), 3)
+    sources, valid = SOURCES(line_of_cameras(0, 0.1, 5, 9), jnp.array([True, False, True, True]), 3)
     np.testing.assert_array_equal(sources[0], [2, 3, 1])
     np.testing.assert_array_equal(valid[0], [True, True, False])
-    alone, valid = nearest_sources(line_of_cameras(0, 1), jnp.array([True, False]), 3)
+    alone, valid = SOURCES(line_of_cameras(0, 1), jnp.array([True, False]), 3)
     assert alone.shape == (2, 1) and not valid[0].any() and int(alone[0, 0]) == 1
 
 
@@ -174,8 +190,8 @@ def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None,
 
     @jax.jit
     def decode(feats, rgbs, num_members, **rest):
-        shapes, parts = read_shapes(params, feats, config), divide_cells(rgbs, config)
-        return decode_tokens(shapes, parts=parts, **rest, num_members=num_members, config=config)
+        shapes, parts = read_shapes(params, feats, config), decoder.divide_cells(rgbs, config)
+        return decoder.decode_tokens(shapes, parts=parts, **rest, num_members=num_members, config=config)
 
     return decode(**inputs, num_members=jnp.broadcast_to(jnp.asarray(num_members), (m,))), inputs
 
@@ -185,7 +201,7 @@ def test_untrained_head_gives_a_disc_of_the_patch_color():
     np.testing.assert_array_equal(gaussians.means, inputs["means"])
     np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0], inputs["rgbs"], atol=1e-6)
     np.testing.assert_array_equal(gaussians.sh[:, 1:], 0)
-    wanted = np.outer(inputs["footprints"], [START_SCALE, START_SCALE, START_THICKNESS])
+    wanted = np.outer(inputs["footprints"], [decoder.START_SCALE, decoder.START_SCALE, decoder.START_THICKNESS])
     np.testing.assert_allclose(gaussians.scales, wanted, rtol=1e-5)
     # The thin axis is the viewing direction of the token's camera.
     np.testing.assert_allclose(quats_to_matrices(gaussians.quats), quats_to_matrices(inputs["quats"]), atol=FLOAT32)
@@ -204,8 +220,8 @@ def test_pivot_is_as_opaque_as_its_members_in_one_place():
         one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
         config = CONFIG.replace(gaussians_per_token=4)
         shapes = TokenShapes(logit_opacities=logit[None], raw_scales=one(3), quats=one(4), sh=jnp.zeros((1, 1, 3)))
-        values = {"means": one(3), "parts": divide_cells(one(12), config), "quats": one(4), "footprints": one()}
-        return decode_tokens(shapes, **values, num_members=n, config=config).opacities[0]
+        values = {"means": one(3), "parts": decoder.divide_cells(one(12), config), "quats": one(4), "footprints": one()}
+        return decoder.decode_tokens(shapes, **values, num_members=n, config=config).opacities[0]
 
     for logit in (-200.0, 0.0, 200.0):
         for n in (0, 1, 2**31 - 1):
@@ -217,11 +233,11 @@ def test_pivot_is_as_opaque_as_its_members_in_one_place():
 def test_gaussians_of_a_token_project_to_their_parts(per_token):
     """In the token's camera, each Gaussian projects to the center of the part whose color it has."""
     config = CONFIG.replace(gaussians_per_token=per_token)
-    camera, images = prepare_views(chunk(), config), np.random.default_rng(0).uniform(size=(3, 32, 32, 3))
-    colors = patch_colors(jnp.asarray(images, jnp.float32), config)
+    camera, images = prepared(chunk()), np.random.default_rng(0).uniform(size=(3, 32, 32, 3))
+    colors = jax.jit(patch_colors, static_argnums=1)(jnp.asarray(images, jnp.float32), config)
     side = math.isqrt(per_token)
-    positions, footprints = back_project(jnp.full((3, 8, 8), np.log(2.0)), camera)
-    quats = matrices_to_quats(jnp.swapaxes(camera.viewmats[:, :3, :3], -1, -2))
+    positions, footprints = BACK_PROJECT(jnp.full((3, 8, 8), np.log(2.0)), camera)
+    quats = jax.jit(matrices_to_quats)(jnp.asarray(np.swapaxes(camera.viewmats[:, :3, :3], -1, -2)))
     gaussians, _ = decoded(
         192,
         means=positions.reshape(-1, 3),
@@ -230,7 +246,7 @@ def test_gaussians_of_a_token_project_to_their_parts(per_token):
         rgbs=colors.reshape(192, -1),
         gaussians_per_token=per_token,
     )
-    points = transform_points(camera.viewmats, gaussians.means.reshape(3, -1, 3))
+    points = jax.jit(transform_points)(camera.viewmats, gaussians.means.reshape(3, -1, 3))
     seen = np.einsum("vij,vnj->vni", camera.Ks, points)
     parts = seen[..., :2] / seen[..., 2:] * side / GRID_STRIDE
     # Footprints are square; cells are not quite, since fx and fy differ by 4 %.
@@ -246,9 +262,9 @@ def divided(patch: np.ndarray) -> dict[tuple[int, int], tuple[int, np.ndarray]]:
     colors = {side: patch.reshape(4 // side, side, 4 // side, side, 3).mean(axis=(1, 3)) for side in (1, 2, 4)}
     finer = lambda side: colors[side // 2] - np.repeat(np.repeat(colors[side], 2, axis=0), 2, axis=1)  # noqa: E731
     side = 4
-    if np.sqrt(np.mean(finer(4) ** 2)) >= MIN_DETAIL[2]:
+    if np.sqrt(np.mean(finer(4) ** 2)) >= decoder.MIN_DETAIL[2]:
         side = 2
-    if np.sqrt(np.mean(finer(2) ** 2)) >= MIN_DETAIL[1]:
+    if np.sqrt(np.mean(finer(2) ** 2)) >= decoder.MIN_DETAIL[1]:
         side = 1
     return {(r, c): (side, colors[side][r // side, c // side]) for r in range(0, 4, side) for c in range(0, 4, side)}
 
@@ -259,7 +275,7 @@ def test_a_patch_is_divided_as_its_detail_asks():
     patches = 0.5 + rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * coarse
     patches += rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * rng.normal(size=(400, 4, 4, 3))
     config = CONFIG.replace(gaussians_per_token=16, detail=True)
-    divide = jax.jit(divide_cells, static_argnums=1)
+    divide = jax.jit(decoder.divide_cells, static_argnums=1)
     parts = jax.tree.map(np.asarray, divide(jnp.asarray(patches.reshape(400, -1), jnp.float32), config))
     sides = set()
     for i, patch in enumerate(patches):
@@ -293,10 +309,10 @@ def test_a_patch_of_four_colors_becomes_the_gaussians_of_four_a_token():
 def test_scales_are_bounded_for_any_feature():
     raw = jnp.array([[1e30, -1e30, 0.0], [jnp.inf, -jnp.inf, 3.0]])
     for by_footprint in (True, False):
-        scales = token_scales(raw, jnp.array([0.1, 1e9]), CONFIG.replace(footprint_scales=by_footprint))
-        assert (scales >= MIN_SCALE).all() and (scales <= MAX_SCALE).all()
+        scales = decoder.token_scales(raw, jnp.array([0.1, 1e9]), CONFIG.replace(footprint_scales=by_footprint))
+        assert (scales >= decoder.MIN_SCALE).all() and (scales <= decoder.MAX_SCALE).all()
     literal = CONFIG.replace(footprint_scales=False, gaussians_per_token=1)
-    scales = token_scales(jnp.array([[0.0, 1.0, 4.0]]), jnp.ones(1), literal)
+    scales = decoder.token_scales(jnp.array([[0.0, 1.0, 4.0]]), jnp.ones(1), literal)
     np.testing.assert_allclose(scales[0], np.log1p(np.exp([-4.0, -3.0, 0.0])), rtol=1e-5)
 
 

@@ -44,8 +44,6 @@ def cameras(width: int, height: int, batch: int | None = None, dtype=np.float32)
         pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
         pose[:3, 3] = [0.1 * i, -0.05, 0.1]
         poses.append(pose.astype(dtype))
-    if batch is None:
-        return Camera(viewmats=jnp.asarray(poses[0]), Ks=jnp.asarray(K), width=width, height=height)
-    return Camera(
-        viewmats=jnp.asarray(np.stack(poses)), Ks=jnp.asarray(np.stack([K] * batch)), width=width, height=height
-    )
+    Ks = jnp.asarray(np.stack([K] * len(poses)))
+    camera = Camera(viewmats=jnp.asarray(np.stack(poses)), Ks=Ks, width=width, height=height)
+    return camera[0] if batch is None else camera

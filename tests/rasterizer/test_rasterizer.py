@@ -18,7 +18,7 @@ from ssplat_jax.rasterizer import Effects, binning, compositing, constants, effe
 from ssplat_jax.rasterizer.binning import Grid, TileIntersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.projection import Splats, project
 from ssplat_jax.rasterizer.reference import render_reference
-from ssplat_jax.rasterizer.render import default_max_pairs
+from ssplat_jax.rasterizer.render import TILES, default_max_pairs
 from ssplat_jax.scene_files.formats import save_ply
 from tests.rasterizer import oracle
 from tests.rasterizer.scenes import cameras, cloud
@@ -141,13 +141,23 @@ def test_overflow_is_counted_inside_jit_and_retried_outside(scene):
 
 
 @plainly
-def test_only_requested_outputs_are_returned(scene):
-    out = render(*scene, effects=Effects(outputs=("color",)), max_pairs=1 << 12)
-    assert not out.others
-    for name in ("alpha", "depth", "median_depth", "features"):
-        with pytest.raises(InputError, match=name):
-            getattr(out, name)
-    np.testing.assert_allclose(out.color, render(*scene, max_pairs=1 << 12).color, atol=1e-6)
+def test_images_and_gradients_are_those_of_any_side_of_a_tile():
+    scene, camera = cloud(), cameras(21, 30)  # no multiple of a tile
+
+    def drawn(gaussians, tile):
+        out = render(gaussians, camera, effects=ALL, max_pairs=1 << 12, tile=tile)
+        images = jnp.concatenate([out.color, out.alpha[..., None], out.depth[..., None]], axis=-1)
+        return jnp.sum(images**2), (images, out.median_depth, out.num_overflow)
+
+    found = {t: jax.jit(jax.value_and_grad(drawn, has_aux=True), static_argnums=1)(scene, t) for t in TILES}
+    (_, (images, median, _)), gradient = found[8]
+    assert float(jnp.abs(images).max()) > 0.5
+    for (_, (other, other_median, overflow)), other_gradient in found.values():
+        assert int(overflow) == 0
+        np.testing.assert_allclose(other, images, atol=2e-5)
+        np.testing.assert_allclose(other_median, median, atol=2e-5)
+        for a, b in zip(jax.tree.leaves(other_gradient), jax.tree.leaves(gradient), strict=True):
+            assert np.linalg.norm(a - b) < 1e-4 * np.linalg.norm(b)
 
 
 @plainly

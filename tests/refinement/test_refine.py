@@ -22,6 +22,7 @@ from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.refinement import KeyViews, RefineConfig, init_refinement, refine
 from ssplat_jax.refinement.compared_views import dissimilarity, held_back_pixels, next_view, view_loss, views_of_step
 from ssplat_jax.refinement.refine_step import MAX_LOG_SCALE_CHANGE, MAX_SHIFT, RATES, RefineState, sizes
+from tests.model.small import side_by_side
 from tests.streaming.narrow_model import assert_same_bits
 
 module = importlib.import_module("ssplat_jax.refinement.refine")  # the package has a function of that name
@@ -44,11 +45,9 @@ def scene(seed: int = 0) -> Gaussians:
 
 def cameras(shifts=(0.0, 0.15, -0.15, 0.3), focal=20.0, width=WIDTH, height=HEIGHT) -> Camera:
     """Cameras side by side that look along +z."""
-    viewmats = np.tile(np.eye(4, dtype=np.float32), (len(shifts), 1, 1))
-    viewmats[:, 0, 3] = shifts
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
-    Ks = np.tile(K, (len(shifts), 1, 1))
-    return Camera(viewmats=jnp.asarray(viewmats), Ks=jnp.asarray(Ks), width=width, height=height)
+    K = jnp.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    viewmats = jnp.asarray(side_by_side(-np.asarray(shifts)), jnp.float32)
+    return Camera(viewmats=viewmats, Ks=jnp.tile(K, (len(shifts), 1, 1)), width=width, height=height)
 
 
 @functools.cache
@@ -260,14 +259,9 @@ def test_gaussians_that_fade_are_removed_and_no_image_changes():
     np.testing.assert_array_equal(*images)
 
 
-@pytest.fixture
-def same_capacity(monkeypatch):
-    """Lets `refine` run the program of `step`."""
-    monkeypatch.setattr(module, "tiles_for", lambda *given: (8, MAX_PAIRS))
-
-
-def test_refinement_learns_a_scene_that_turns_its_colors_and_ends_on_one_that_fits(same_capacity):
+def test_refinement_learns_a_scene_that_turns_its_colors_and_ends_on_one_that_fits(monkeypatch):
     """A view never shown gains, where a constant color cannot follow; absent rows stay."""
+    monkeypatch.setattr(module, "tiles_for", lambda *given: (8, MAX_PAIRS))  # the program of `step`
     bands = np.random.default_rng(2).normal(0, 0.4, (NUM, 3, 3))
     turning = replace(scene(), sh=jnp.concatenate([scene().sh, jnp.asarray(bands, jnp.float32)], axis=1))
     seen, unseen = cameras(shifts=(-1.0, -0.3, 0.3, 1.0)), cameras(shifts=(0.6,))

@@ -16,22 +16,10 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import render
 from ssplat_jax.runs.run_results import scene_to_show
 from ssplat_jax.runs.scene_outputs import KnownCameras, difference_in_words, export_scene, turned
-from ssplat_jax.scene_files.formats import file_axes, save_ply
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.scene_files.formats import file_axes
 from ssplat_jax.streaming.session import middle_exposure
-from tests.commands.command_fixture import run
 from tests.rasterizer.scenes import balls
 from tests.scene_files.scene_fixture import camera, scene
-
-
-def test_a_scene_that_is_decoded_needs_no_weights(tmp_path, capsys):
-    gaussians = scene(0)
-    save_ply(RunFolder(tmp_path).scene, gaussians)  # as `ssplat demo` leaves it: no saved state
-    assert run("export", tmp_path, "--to", tmp_path / "scene.spz") == 0
-    assert f"{gaussians.num_gaussians} Gaussians" in capsys.readouterr().out
-    for given in (tmp_path, tmp_path / "scene.ply"):
-        assert run("export", given, "--to", tmp_path / "x.splat", "--weights", "other.npz") == 2
-        assert "--weights: wanted a run" in capsys.readouterr().err
 
 
 def test_the_middle_exposure_is_a_median_per_channel():

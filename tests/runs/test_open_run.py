@@ -15,15 +15,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses import adjust_poses as adjusting
-from ssplat_jax.runs.open_run import (
-    capture_to_stream,
-    deciding,
-    load_poses,
-    load_run,
-    open_capture_of_scene,
-    open_run,
-    with_poses_of_run,
-)
+from ssplat_jax.runs import open_run
 from ssplat_jax.storage.chunk_records import load_chunk_records, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
@@ -41,7 +33,9 @@ def capture():
 
 
 def opened(capture, out, reporter=QUIET, **options):
-    return open_run(StreamSplat(CONFIG), load_params("tiny"), capture, range(8), out, reporter=reporter, **options)
+    return open_run.open_run(
+        StreamSplat(CONFIG), load_params("tiny"), capture, range(8), out, reporter=reporter, **options
+    )
 
 
 def save_views(run, count):
@@ -61,7 +55,7 @@ def test_a_damaged_state_is_kept_aside_and_the_one_before_takes_its_place(captur
     folder = RunFolder(tmp_path)
     good, damaged = previous_path(folder.state).read_bytes(), folder.state.read_bytes()[:-7]
     folder.state.write_bytes(damaged)
-    assert load_run(tmp_path, QUIET).header["done"] == 4
+    assert open_run.load_run(tmp_path, QUIET).header["done"] == 4
     capsys.readouterr()
     with opened(capture, tmp_path, Reporter()) as run:
         assert "after 4 views" in " ".join(capsys.readouterr().err.split())
@@ -85,7 +79,7 @@ def test_no_readable_state_suggests_overwrite(capture, tmp_path):
 
 def test_capacity_matters_only_if_tokens_may_be_dropped():
     def fields(**changes):
-        return deciding(preset("tiny").replace(**changes).to_dict())
+        return open_run.deciding(preset("tiny").replace(**changes).to_dict())
 
     assert fields(capacity=1024) == fields(capacity=4096)
     assert fields(overflow="drop_new", capacity=1024) != fields(overflow="drop_new", capacity=4096)
@@ -125,16 +119,16 @@ def test_all_that_follows_sees_the_adjusted_poses(adjusted, capture, capsys):
     with pytest.raises(InputError, match="differs in its poses"), opened(capture, adjusted):
         pass
     path = f"{CAPTURE}&size={SIZE[0]}x{SIZE[1]}"
-    np.testing.assert_array_equal(load_run(adjusted, QUIET).open_capture(CAPTURE).camtoworlds, wanted)
+    np.testing.assert_array_equal(open_run.load_run(adjusted, QUIET).open_capture(CAPTURE).camtoworlds, wanted)
     for place in (adjusted, adjusted / "scene.ply"):
-        np.testing.assert_array_equal(open_capture_of_scene(place, path, None, QUIET).camtoworlds, wanted)
+        np.testing.assert_array_equal(open_run.open_capture_of_scene(place, path, None, QUIET).camtoworlds, wanted)
     capsys.readouterr()
     other = "procedural:room?frames=3"  # it has its own poses
-    found = open_capture_of_scene(adjusted, other, SIZE, QUIET)
+    found = open_run.open_capture_of_scene(adjusted, other, SIZE, QUIET)
     np.testing.assert_array_equal(found.camtoworlds, open_capture(other, size=SIZE).camtoworlds)
     assert "adjusted_poses.npz is of another capture" in capsys.readouterr().err
     with pytest.raises(InputError, match="wanted the capture of the run"):
-        load_run(adjusted, QUIET).open_capture(other)
+        open_run.load_run(adjusted, QUIET).open_capture(other)
 
 
 def test_a_new_run_leaves_nothing_that_could_pass_for_its_own(capture, tmp_path):
@@ -165,17 +159,17 @@ def test_a_run_that_began_with_given_poses_takes_no_adjusted_ones(capture, tmp_p
     folder = RunFolder(tmp_path)
     folder.state.write_bytes(b"of a run that began without")
     with adjustment(is_found=False), pytest.raises(InputError, match="--adjust-poses: wanted a run that began with it"):
-        capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=True)
-    assert capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
+        open_run.capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=True)
+    assert open_run.capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
 
 
 def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(capture, tmp_path):
     folder = RunFolder(tmp_path)
     with adjustment():
-        capture_to_stream(capture, (0, 2), folder, QUIET, adjust_poses=True)
-        streamed = capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=True)
+        open_run.capture_to_stream(capture, (0, 2), folder, QUIET, adjust_poses=True)
+        streamed = open_run.capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=True)
     np.testing.assert_array_equal(streamed.camtoworlds, moved(capture, range(4)).capture.camtoworlds)
-    assert capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
+    assert open_run.capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
     assert not folder.adjusted_poses.exists()  # no later command takes them for those of the run
 
 
@@ -183,9 +177,9 @@ def test_damaged_poses_are_named(capture, tmp_path):
     folder = RunFolder(tmp_path)
     folder.adjusted_poses.write_text("{")
     with pytest.raises(StorageError, match=r"adjusted_poses\.npz: the file is corrupt"):
-        with_poses_of_run(capture, folder)
+        open_run.with_poses_of_run(capture, folder)
     folder.state.write_bytes(b"of the run")
-    assert capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
+    assert open_run.capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
     assert folder.adjusted_poses.exists()  # what belongs to a run stays
     folder.clear_run()
-    assert load_poses(folder) is None
+    assert open_run.load_poses(folder) is None

@@ -54,8 +54,14 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     assert result.after["shown"]["psnr"] > result.before["shown"]["psnr"]
 
     folder.clear_refinement()
-    stop_after_each_step(monkeypatch)
-    so_far = [streamed]
+    steps, so_far = module.Progress.steps, [streamed]
+
+    def stopped_after_one(progress, planned):
+        for _ in steps(progress, planned):
+            signal.raise_signal(signal.SIGINT)
+            yield
+
+    monkeypatch.setattr(module.Progress, "steps", stopped_after_one)
     for taken in (1, 2):
         result = refine(finished)
         assert (result.num_steps, result.interrupted) == (taken, signal.SIGINT)
@@ -81,27 +87,5 @@ def test_report_and_pictures_become_those_of_the_refined_scene(finished):
         assert f"{scores['shown']['psnr']:.2f} dB" in page
     refined = [path.read_bytes() for path in sorted(folder.views.iterdir())]
     assert len(refined) == len(pictures) and not set(refined) & set(pictures)
-
-
-def stop_after_each_step(monkeypatch):
-    """Refinements get SIGINT after every step."""
-    steps = module.Progress.steps
-
-    def stopped_after_one(progress, planned):
-        for _ in steps(progress, planned):
-            signal.raise_signal(signal.SIGINT)
-            yield
-
-    monkeypatch.setattr(module.Progress, "steps", stopped_after_one)
-
-
-def test_a_refinement_with_other_steps_is_refused(finished):
-    refine(finished, steps=2, overwrite=True)
     with pytest.raises(InputError, match="differs in its steps"):
         refine(finished, steps=3)
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"found no state\.npz"):
-        refine(tmp_path)
-    assert not list(tmp_path.iterdir())

@@ -27,7 +27,6 @@ SHAPE = (1, 2, 4)
 MEAN = CONFIG.replace(depth_readout="mean")
 WINDOW = CONFIG.replace(depth_readout="window")
 READOUTS = {"mean": MEAN, "window": WINDOW}
-OPTIONS = ("log_anchor",)
 CANDIDATES = jnp.linspace(jnp.log(1.0), jnp.log(6.0), D)
 
 ANCHORS = {}  # name -> (changes to the ordinary inputs, check of the result)
@@ -106,21 +105,6 @@ anchor_case(
 anchor_case("sigma in scene units", log_anchor=False, confidences=1.0, at=5, raw_gamma=1e6)
 
 
-def check_distribution(probs) -> None:
-    """Probabilities are nonnegative and sum to 1."""
-    assert (np.asarray(probs) >= 0).all()
-    np.testing.assert_allclose(np.asarray(probs, np.float64).sum(-1), 1.0, rtol=0, atol=PROBABILITY_SUM_ATOL)
-
-
-def check_depths(depth, log_candidates) -> None:
-    """Depths lie between the end candidates, and confidences in (0, 1]."""
-    check_distribution(depth.probs)
-    low, high = float(log_candidates.min()), float(log_candidates.max())
-    assert (depth.log_depths >= low - FLOAT32).all() and (depth.log_depths <= high + FLOAT32).all()
-    for confidences in (depth.matcher_confidences, depth.anchored_confidences):
-        assert (confidences > 0).all() and (confidences <= 1).all()
-
-
 def wave(tree):
     """A loss that depends on every entry of every leaf."""
     return sum(jnp.mean(jnp.sin(3 * x.astype(jnp.float32))) for x in jax.tree.leaves(tree))
@@ -149,12 +133,11 @@ def anchor_inputs(changes: dict, config) -> dict:
         "confidences": rng.uniform(0.1, 1, SHAPE),
         "log_candidates": CANDIDATES,
     } | changes
-    options = {name: given.pop(name) for name in OPTIONS if name in given}
     if "at" in given:  # halfway between candidates too
         given["depths"] = np.exp(np.interp(given.pop("at"), np.arange(D), given["log_candidates"]))
     for name in ("depths", "confidences"):
         given[name] = np.broadcast_to(given[name], SHAPE)
-    return given | {"config": config.replace(**options)}
+    return given | {"config": config.replace(log_anchor=given.pop("log_anchor", True))}
 
 
 @pytest.mark.parametrize("readout", READOUTS)
@@ -167,7 +150,12 @@ def test_hard_anchor(name, readout):
     (value, (matched, result)), gradients = anchoring(given["config"])(*inputs, past)
     assert finite((value, result)), "value"
     assert finite(gradients), "gradient"
-    check_depths(result, given["log_candidates"])
+    assert (np.asarray(result.probs) >= 0).all()
+    np.testing.assert_allclose(np.asarray(result.probs, np.float64).sum(-1), 1.0, rtol=0, atol=PROBABILITY_SUM_ATOL)
+    low, high = float(given["log_candidates"].min()), float(given["log_candidates"].max())
+    assert (result.log_depths >= low - FLOAT32).all() and (result.log_depths <= high + FLOAT32).all()
+    for confidences in (result.matcher_confidences, result.anchored_confidences):
+        assert (confidences > 0).all() and (confidences <= 1).all()
     if limit is not None:
         limit(given, matched, result)
     if given["logits"].shape[-1] == 1:  # nothing to choose between

@@ -25,8 +25,8 @@ NARROW = StreamConfig().replace(
 )
 """A small model without a confidence threshold, which the flat distributions of untrained weights would not pass."""
 
-FEW_GAUSSIANS = NARROW.replace(gaussians_per_token=4)
-"""The narrow model with few Gaussians, for tests around the stream, which render scenes many times."""
+FEW_GAUSSIANS = NARROW.replace(gaussians_per_token=4, mixer_blocks=0)
+"""The narrow model with few Gaussians and no mixer, for tests around the stream, which render scenes many times."""
 
 
 def leaves_with_names(tree):

@@ -113,7 +113,7 @@ def test_unusable_views_are_refused_and_do_not_count(capture, start):
 def test_pushed_masks_give_what_a_masked_capture_gives(capture, programs_shared, monkeypatch):
     """The first mask comes with the second chunk of a stream that refines; the capture has masks from the start."""
     monkeypatch.setattr("ssplat_jax.refinement.online._refine_view", lambda model, params, cache, view: cache)
-    model = StreamSplat(CAUSAL.replace(steps_per_chunk=1, hpda=False, cgfi=False, mixer_blocks=0, detail=False))
+    model = StreamSplat(CAUSAL.replace(steps_per_chunk=1, hpda=False, cgfi=False, detail=False))
     params = random_params(model.config)
     masks = np.ones((NUM_FRAMES, 48, 64), bool)
     masks[5:7, 8:24, 12:36] = False

@@ -1,6 +1,6 @@
 """A sharded stream equals streams on one device: the cache's voxels to the last bit, whole steps to rounding.
 
-The steps run on the devices of two other processes (`sharded_worker`), because this process has one device.
+The steps run on the devices of two other processes (`main`), because this process has one device.
 """
 
 import functools
@@ -8,18 +8,22 @@ import pickle
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import NamedSharding
+from jax.sharding import PartitionSpec as P
 
 from ssplat_jax.cache.fuse import fuse
 from ssplat_jax.cache.hash_table import shards_of
 from ssplat_jax.cache.project import project
-from ssplat_jax.cache.state import PIVOT_FIELDS, grow, init_cache
+from ssplat_jax.cache.state import PIVOT_FIELDS, check_cache, grow, init_cache
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.streaming.sharded import ShardedStream
 from tests.cache.projection_scenes import cameras
 from tests.cache.streams import CONFIG, FEATURES, PLACES, Recipe, to_jax
 from tests.cache.streams import fuse as fuse_alone
@@ -35,12 +39,12 @@ TIMEOUT = 300  # seconds; a run usually takes some twenty
 
 
 def on_two_processes(folder, job):
-    """Results of `sharded_worker.steps` on four devices of two processes."""
+    """Results of `steps` on four devices of two processes."""
     (folder / "job.pkl").write_bytes(pickle.dumps(job))
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "tests.streaming.sharded_worker", str(folder)]
+    command = [sys.executable, "-m", __name__, str(folder)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     processes = [subprocess.Popen([*command, str(process), "2", str(port)], **pipes) for process in range(2)]
     try:
@@ -165,3 +169,52 @@ def test_streams_together_equal_each_stream_alone(tmp_path):
         np.testing.assert_allclose(opacities.sum(), model.decode(params, cache).opacities.sum(), rtol=STEP_RTOL)
         for i, shard in enumerate(shards):
             assert_same_bits(part(grown, stream, i), grow(jax.tree.map(jnp.asarray, shard), capacity))
+
+
+# A process with two devices, which steps a stream together with others -----------------------------------------------
+
+
+def steps(mesh, config, params, chunks, num_new_tokens):
+    """Caches and outputs of every step over `chunks` `[t, streams, ...]`, the last scenes, and the grown caches."""
+    sharded = ShardedStream(StreamSplat(config), mesh)
+    params, step = on_mesh(mesh, P(), params), jax.jit(sharded.step, donate_argnums=1)
+    caches, history = sharded.init_cache(chunks.valid.shape[1]), []
+    for t in range(len(chunks.valid)):
+        caches, output = step(params, caches, on_mesh(mesh, P("streams"), jax.tree.map(lambda x, t=t: x[t], chunks)))
+        history.append(everywhere(mesh, (caches, output)))
+    check_cache(caches, sharded.model.config)
+    grown = sharded.ensure_capacity(caches, num_new_tokens)
+    scenes = jax.jit(sharded.decode)(params, caches)
+    return history, step._cache_size(), *everywhere(mesh, (scenes, grown))
+
+
+def on_mesh(mesh, spec, tree):
+    """`tree`, which every process has, placed on the devices of the mesh."""
+    sharding = NamedSharding(jax.sharding.Mesh(mesh.devices, mesh.axis_names), spec)
+    return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, sharding, lambda part: x[part]), tree)
+
+
+def everywhere(mesh, tree):
+    """The whole arrays, on the host of every process."""
+    sharding = NamedSharding(jax.sharding.Mesh(mesh.devices, mesh.axis_names), P())
+    return jax.tree.map(np.asarray, jax.jit(unchanged, out_shardings=sharding)(tree))
+
+
+def unchanged(tree):
+    """The identity; a function of the module, so that it is compiled once for each structure."""
+    return tree
+
+
+def main(folder, process, num_processes, port):
+    jax.config.update("jax_num_cpu_devices", 2)
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.config.update("jax_disable_most_optimizations", True)  # they take longer than the steps
+    jax.distributed.initialize(f"localhost:{port}", num_processes, process)
+    mesh = jax.make_mesh((2, num_processes), ("streams", "voxels"))
+    results = steps(mesh, **pickle.loads((folder / "job.pkl").read_bytes()))
+    if process == 0:
+        (folder / "results.pkl").write_bytes(pickle.dumps(results))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *(int(x) for x in sys.argv[2:]))

@@ -1,12 +1,7 @@
-"""Compilation of the programs of these tests."""
+"""Type promotion in these tests."""
 
 import jax
 import pytest
-
-
-@pytest.fixture(autouse=True)
-def _compiled_plainly(compiled_plainly):
-    pass
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -17,17 +17,7 @@ from ssplat_jax.training import loop
 from ssplat_jax.training.recipe import RECIPES, Recipe, learning
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits
-from tests.training.problems import (
-    FIRST,
-    QUADRATIC,
-    STREAM_PHASE,
-    Numbers,
-    Squares,
-    flat,
-    flat_names,
-    start_params,
-    train_quadratic,
-)
+from tests.training import problems
 
 FLOAT32 = 2e-6  # relative rounding of a few dozen operations
 
@@ -43,12 +33,12 @@ def scheduled(phase, place):
 
 def formulas(recipe):
     """Parameters, their average and skipped steps of the quadratic problem: clipping, AdamW and average in float64."""
-    x = {name: np.asarray(value, np.float64) for name, value in flat_names(start_params()).items()}
+    x = {name: np.asarray(value, np.float64) for name, value in problems.flat_names(problems.start_params()).items()}
     mean, square, average = ({name: np.zeros(3) for name in x} for _ in range(3))
     steps = [(phase, place) for phase in recipe.phases for place in range(phase.steps)]
     updates = 0
     for step, (phase, place) in enumerate(steps):
-        start = SimpleNamespace(seed=recipe.seed, params=start_params())
+        start = SimpleNamespace(seed=recipe.seed, params=problems.start_params())
         make = phase.samples.open(start)  # samples may depend on the first parameters
         numbers = np.float64(make(step, place))
         paths = {name: name.strip("[]'").replace("']['", "/") for name in x}
@@ -72,14 +62,14 @@ def formulas(recipe):
 
 def test_steps_follow_the_formulas(tmp_path):
     """Clipping, AdamW, schedule, rates of parts, average, and a skipped step, through two phases."""
-    done = train_quadratic(tmp_path)
-    params, average, num_skipped = formulas(QUADRATIC)
+    done = problems.train_quadratic(tmp_path)
+    params, average, num_skipped = formulas(problems.QUADRATIC)
     assert int(done.state.optimizer[0].total_notfinite) == num_skipped == 1
-    for name, value in flat_names(done.state.params).items():
+    for name, value in problems.flat_names(done.state.params).items():
         np.testing.assert_allclose(value, params[name], rtol=FLOAT32, atol=FLOAT32, err_msg=name)
-        np.testing.assert_allclose(flat_names(done.params)[name], average[name], rtol=FLOAT32, atol=FLOAT32)
+        np.testing.assert_allclose(problems.flat_names(done.params)[name], average[name], rtol=FLOAT32, atol=FLOAT32)
     assert "hpda" not in done.state.params
-    assert_same_bits(done.params["hpda"], start_params()["hpda"])
+    assert_same_bits(done.params["hpda"], problems.start_params()["hpda"])
     records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [(r["step"], r["phase"], r["skipped"]) for r in records] == [(10, "second", 1), (16, "second", 1)]
 
@@ -89,7 +79,7 @@ class Stop(Exception):
 
 
 def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
-    whole = train_quadratic(tmp_path / "whole")
+    whole = problems.train_quadratic(tmp_path / "whole")
 
     def fail(record):
         if record["step"] == 5:
@@ -101,32 +91,36 @@ def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
 
     every = {"save_every": 2, "log_every": 1}
     with pytest.raises(Stop):
-        train_quadratic(tmp_path / "parts", report=fail, **every)
-    stopped = train_quadratic(tmp_path / "parts", report=interrupt, **every)
+        problems.train_quadratic(tmp_path / "parts", report=fail, **every)
+    stopped = problems.train_quadratic(tmp_path / "parts", report=interrupt, **every)
     assert (stopped.step, stopped.interrupted) == (9, signal.SIGTERM)
-    parts = train_quadratic(tmp_path / "parts", **every)
+    parts = problems.train_quadratic(tmp_path / "parts", **every)
     assert (parts.step, parts.interrupted) == (16, None)
     assert_same_bits(parts.state, whole.state)
     assert_same_bits(parts.params, whole.params)
     records = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
     assert [record["step"] for record in records] == list(range(1, 17))
-    assert_same_bits(train_quadratic(tmp_path / "parts").params, whole.params)  # a finished run is only read
+    assert_same_bits(problems.train_quadratic(tmp_path / "parts").params, whole.params)  # a finished run is only read
 
 
 @pytest.mark.slow  # compiles a whole step that renders
 def test_a_rendering_phase_moves_all_its_stages(tmp_path):
     params = random_params(NARROW)
-    done = loop.train(NARROW, Recipe((STREAM_PHASE,)), tmp_path, params=params)
-    assert done.step == 2 and all(np.isfinite(x).all() for x in flat(done.params))
+    done = loop.train(NARROW, Recipe((problems.STREAM_PHASE,)), tmp_path, params=params)
+    assert done.step == 2 and all(np.isfinite(x).all() for x in problems.flat(done.params))
     for name in filter(params.get, done.state.params):
-        pairs = zip(flat(params[name]), flat(done.params[name]), strict=True)
+        pairs = zip(problems.flat(params[name]), problems.flat(done.params[name]), strict=True)
         assert any(not np.array_equal(a, b) for a, b in pairs), name
 
 
-def test_a_phase_without_anything_to_train_is_refused(tmp_path):
-    recipe = Recipe((dataclasses.replace(FIRST, rates=learning("evidence")),))
-    with pytest.raises(InputError, match="wanted a configuration with evidence"):
-        train_quadratic(tmp_path / "out", recipe)
+def test_recipes_that_the_configuration_or_the_samples_do_not_fit_are_refused(tmp_path):
+    untrainable = Recipe((dataclasses.replace(problems.FIRST, rates=learning("evidence")),))
+    for recipe, words in (
+        (untrainable, "wanted a configuration with evidence"),
+        (RECIPES["paper"], "captures that share all steps"),
+    ):
+        with pytest.raises(InputError, match=words):
+            problems.train_quadratic(tmp_path / "out", recipe)
     assert not (tmp_path / "out").exists()
 
 
@@ -139,26 +133,21 @@ def test_the_paper_recipe_takes_steps_of_plain_adamw(tmp_path):
         rate = loop.schedule(recipe, (phase.rate(part),))
         np.testing.assert_allclose([rate(step) for step in (0, 1, 50_000, 99_999)], 1e-4, rtol=1e-6)
     assert (recipe.weight_decay, recipe.adam_b2, recipe.clip_norm, recipe.ema_decay) == (0.01, 0.999, None, 0)
-    short = dataclasses.replace(phase, steps=9, samples=Numbers(), loss=Squares(1e4))  # a gradient that is long
+    long = problems.Squares(1e4)  # its gradient is long
+    short = dataclasses.replace(phase, steps=9, samples=problems.Numbers(), loss=long)
     recipe = dataclasses.replace(recipe, phases=(short,), captures_alone=False)
-    done, (params, _, _) = train_quadratic(tmp_path, recipe), formulas(recipe)
-    for name, value in flat_names(done.params).items():
+    done, (params, _, _) = problems.train_quadratic(tmp_path, recipe), formulas(recipe)
+    for name, value in problems.flat_names(done.params).items():
         np.testing.assert_allclose(value, params[name], rtol=FLOAT32, atol=FLOAT32, err_msg=name)
     assert_same_bits(done.params, done.state.params)
 
 
-def test_the_paper_recipe_learns_from_captures_alone(tmp_path):
-    with pytest.raises(InputError, match="captures that share all steps"):
-        loop.train(NARROW, RECIPES["paper"], tmp_path / "out", params=start_params())
-    assert not (tmp_path / "out").exists()
-
-
 def test_processes_draw_samples_of_their_own(tmp_path, monkeypatch):
-    alone = train_quadratic(tmp_path / "0").params
+    alone = problems.train_quadratic(tmp_path / "0").params
     monkeypatch.setattr(jax, "process_index", lambda: 1)
-    second, other = train_quadratic(tmp_path / "1").params, dataclasses.replace(QUADRATIC, seed=1)
+    second, other = problems.train_quadratic(tmp_path / "1").params, dataclasses.replace(problems.QUADRATIC, seed=1)
     monkeypatch.undo()
-    assert_same_bits(second, train_quadratic(tmp_path / "2", other).params)
+    assert_same_bits(second, problems.train_quadratic(tmp_path / "2", other).params)
     assert not np.array_equal(alone["decoder"]["w"], second["decoder"]["w"])
 
 

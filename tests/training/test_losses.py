@@ -18,16 +18,6 @@ from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.training import loop, losses
 from ssplat_jax.training.crops import CropSample, crop_camera
-from ssplat_jax.training.losses import (
-    MAX_GAIN,
-    CropLoss,
-    DepthLoss,
-    RenderingLoss,
-    decode_accepted,
-    depth_loss,
-    fitted_gains,
-    negative_psnr,
-)
 from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import Sample
 from tests.cache import streams
@@ -39,7 +29,7 @@ from tests.streaming.narrow_model import NARROW
 from tests.streaming.test_scene_delta import decoder_params
 from tests.training.problems import NARROW_DEPTH, STREAM_PHASE
 
-WIDTH = DepthLoss.target_width
+WIDTH = losses.DepthLoss.target_width
 
 
 def sample_of(log_depths, images, camera, is_photographed=False) -> Sample:
@@ -58,7 +48,7 @@ def test_unusable_cells_have_neither_value_nor_gradient_in_the_depth_loss():
 
     @jax.jit
     def loss(logits, predicted, truth, usable):
-        return sum(depth_loss(logits, predicted, truth, candidates, usable, target_width=WIDTH))
+        return sum(losses.depth_loss(logits, predicted, truth, candidates, usable, target_width=WIDTH))
 
     value, gradients = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(logits, predicted, truth, usable)
     # As if those cells did not exist: the mean is over the others.
@@ -75,7 +65,7 @@ def test_cells_of_unknown_depth_leave_the_loss_finite(candidates):
 
     def loss(logits, predicted, unknown):
         truth, values = jnp.array([[[0.5, 0.0]]]).at[0, 0, 1].set(unknown), jnp.asarray(candidates, jnp.float32)
-        return sum(depth_loss(logits, predicted, truth, values, usable, target_width=WIDTH))
+        return sum(losses.depth_loss(logits, predicted, truth, values, usable, target_width=WIDTH))
 
     sloped = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
     for unknown in (-np.inf, np.inf, np.nan, 3.0):
@@ -91,11 +81,11 @@ def test_gradients_of_losses_are_finite_differences():
         truth = jnp.asarray(rng.uniform(0.1, 0.9, (1, 2, 3)))
         candidates, usable = jnp.linspace(0.0, 1.0, 5), jnp.ones((1, 2, 3), bool)
         images, targets = (jnp.asarray(rng.uniform(0.1, 0.9, (2, 4, 5, 3))) for _ in range(2))
-        depth = lambda logits, z: sum(depth_loss(logits, z, truth, candidates, usable, target_width=WIDTH))  # noqa: E731
+        depth = lambda logits, z: sum(losses.depth_loss(logits, z, truth, candidates, usable, target_width=WIDTH))  # noqa: E731
         cases = [
             (depth, (jnp.asarray(rng.normal(size=(1, 2, 3, 5))), truth + 0.05)),
-            (lambda x: RenderingLoss().of_images(x, targets)[0], (images,)),
-            (lambda x: negative_psnr(x[0], targets[0]), (images,)),
+            (lambda x: losses.RenderingLoss().of_images(x, targets)[0], (images,)),
+            (lambda x: losses.negative_psnr(x[0], targets[0]), (images,)),
         ]
         for loss, arguments in cases:
             loss = jax.jit(loss)
@@ -134,7 +124,7 @@ def test_the_loss_of_a_crop_is_its_psnr_less_what_lpips_costs_filled_and_over_bl
     target = image.astype(np.float64) / 255
     psnrs = [-10 * np.log10(((x - target) ** 2).mean() + losses.MIN_MSE) for x in (0.25, 0.0)]
     costs = [20.0 * 3.0 * np.abs(x - target).max() for x in (0.25, 0.0)]
-    loss = jax.jit(functools.partial(CropLoss(black_weight=0.4, lpips_weight=20.0), model))
+    loss = jax.jit(functools.partial(losses.CropLoss(black_weight=0.4, lpips_weight=20.0), model))
     value, metrics = loss(params, (crop,), LpipsWeights((), (), ()))
     wanted = sum(share * (cost - x) for share, cost, x in zip((0.6, 0.4), costs, psnrs, strict=True))
     assert float(value) == pytest.approx(wanted, rel=1e-5)
@@ -147,7 +137,7 @@ def test_masked_pixels_of_a_target_have_neither_value_nor_gradient():
     cameras = Camera(jnp.eye(4)[None], jnp.array([[[10.0, 0, 8], [0, 10, 6], [0, 0, 1]]]), 16, 12)
     targets = jnp.asarray(rng.uniform(size=(1, 12, 16, 3)), jnp.float32)
     seen = jnp.ones((1, 12, 16), bool).at[:, :, :8].set(False)
-    loss = RenderingLoss(max_pairs=1 << 12)
+    loss = losses.RenderingLoss(max_pairs=1 << 12)
 
     @jax.jit
     @jax.value_and_grad
@@ -167,11 +157,11 @@ def test_fitted_gains_undo_exposures_and_stay_bounded():
     true = np.array([[0.7, 1.0, 1.4], [5.0, 0.01, 1.2]], np.float32)
     targets = jnp.concatenate([images[:2] * true[:, None, None], images[2:]])
     images = images.at[2].set(0.0)
-    gains = np.asarray(fitted_gains(images, targets))[:, 0, 0]
+    gains = np.asarray(losses.fitted_gains(images, targets))[:, 0, 0]
     np.testing.assert_allclose(gains[0], true[0], rtol=1e-5)
-    np.testing.assert_allclose(gains[1], [MAX_GAIN, 1 / MAX_GAIN, 1.2], rtol=1e-5)
+    np.testing.assert_allclose(gains[1], [losses.MAX_GAIN, 1 / losses.MAX_GAIN, 1.2], rtol=1e-5)
     np.testing.assert_array_equal(gains[2], 1.0)  # nothing rendered
-    gradient = jax.grad(lambda x: fitted_gains(x, targets).sum())(images)
+    gradient = jax.grad(lambda x: losses.fitted_gains(x, targets).sum())(images)
     np.testing.assert_array_equal(np.asarray(gradient), 0.0)
 
 
@@ -180,7 +170,7 @@ def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
     config = streams.CONFIG.replace(detail=False)
     cache = after_chunk(init_cache(config, streams.CAPACITY), front_camera(), seen(2.0))
     tokens = streams.tokens_at([[0, 0, 1.0], [0, 0, 2.0], [0, 0, 3.0], [0, 0, 2.0]], jnp.array([0.6, 0.6, 0.6, 0.2]))
-    accepted = jax.jit(functools.partial(decode_accepted, StreamSplat(config)))
+    accepted = jax.jit(functools.partial(losses.decode_accepted, StreamSplat(config)))
     shown = np.asarray(accepted(decoder_params(config), cache, tokens).opacities > 0).reshape(4, -1)
     np.testing.assert_array_equal(shown, np.broadcast_to([[False], [True], [True], [False]], shown.shape))
 
@@ -197,8 +187,8 @@ def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, lo
         return None, None, value, {"depth_l1": value}
 
     of_scene = lambda self, scene, sample, lpips: (jnp.mean(sample.target_images) * scene, {})  # noqa: E731
-    monkeypatch.setattr(DepthLoss, "of_stream", of_stream)
-    monkeypatch.setattr(RenderingLoss, "of_scene", of_scene)
+    monkeypatch.setattr(losses.DepthLoss, "of_stream", of_stream)
+    monkeypatch.setattr(losses.RenderingLoss, "of_scene", of_scene)
     monkeypatch.setattr(losses, "decode_accepted", lambda model, params, cache, tokens: params["a"][0])
     of = jax.value_and_grad(lambda params, x: loss(StreamSplat(NARROW), params, x), has_aux=True)
     params = {"a": jnp.array([1.5, -0.5])}

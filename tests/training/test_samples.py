@@ -13,26 +13,15 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.procedural.procedural_views import training_sample
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.saved_states import first_difference
-from ssplat_jax.training import loop
+from ssplat_jax.training import loop, samples
 from ssplat_jax.training.recipe import RECIPES
-from ssplat_jax.training.samples import (
-    CaptureGroup,
-    CaptureMix,
-    TrainingStart,
-    ViewSamples,
-    capture_sample,
-    learned_frames,
-    log_depths_at_cells,
-    open_mix,
-    procedural_sample,
-)
 from tests.badinputs.cases import make_capture
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 from tests.training.problems import STREAM_PHASE
 
 NUM_FRAMES, SIZE = 22, (32, 48)  # height and width
-VIEWS = ViewSamples(num_chunks=2, sizes=(SIZE,), num_targets=3)
-SMALL = ViewSamples(num_chunks=1, sizes=((32, 48),))
+VIEWS = samples.ViewSamples(num_chunks=2, sizes=(SIZE,), num_targets=3)
+SMALL = samples.ViewSamples(num_chunks=1, sizes=((32, 48),))
 
 
 @pytest.fixture(scope="module")
@@ -46,20 +35,12 @@ def mix(capture):
 
 
 def mix_of(capture, share=1.0):
-    return CaptureMix((CaptureGroup("room", share, (capture,)),), NARROW)
+    return samples.CaptureMix((samples.CaptureGroup("room", share, (capture,)),), NARROW)
 
 
 def opened(views, mix=None, num_steps=4):
     """The function that makes the batches of a training with these samples."""
-    return views.open(TrainingStart(StreamSplat(NARROW), {}, mix, 0, num_steps, print))
-
-
-def test_a_procedural_sample_starts_at_the_origin_with_depths_in_range():
-    sample = procedural_sample(dataclasses.replace(SMALL, num_targets=1), 5, SMALL.sizes[0], NARROW)
-    np.testing.assert_allclose(np.asarray(sample.chunks.viewmats[0, 0]), np.eye(4), atol=1e-6)
-    depths = np.exp(np.asarray(sample.log_depths))
-    inside = (depths > float(sample.chunks.near[0])) & (depths < float(sample.chunks.far[0]))
-    assert inside.mean() > 0.97  # the margins exclude at most the tails beyond the 1 % quantiles
+    return views.open(samples.TrainingStart(StreamSplat(NARROW), {}, mix, 0, num_steps, print))
 
 
 def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
@@ -67,7 +48,7 @@ def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
     views, shares = dataclasses.replace(SMALL, kinds=("yard",), range_jitter=0.0), []
     for seed in range(4):
         _, depths, _, _ = training_sample(seed, 4, *SMALL.sizes[0], kinds=("yard",))
-        sample = procedural_sample(views, seed, SMALL.sizes[0], NARROW)
+        sample = samples.procedural_sample(views, seed, SMALL.sizes[0], NARROW)
         far = float(sample.chunks.far[0])
         cells = np.exp(np.asarray(sample.log_depths))
         is_sky = np.isclose(cells, far, rtol=1e-3)
@@ -76,6 +57,9 @@ def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
         scale = MEDIAN_DEPTH / np.median(surfaces)
         assert far == pytest.approx(FAR_FACTOR * scale * np.quantile(surfaces, 0.99), rel=1e-5)
         assert is_sky.mean() == pytest.approx(np.isinf(depths).mean(), abs=0.05)
+        # The margins exclude at most the tails beyond the 1 % quantiles; the stream starts at the origin.
+        assert ((cells > float(sample.chunks.near[0])) & (cells < far))[~is_sky].mean() > 0.97
+        np.testing.assert_allclose(sample.chunks.viewmats[0, 0], np.eye(4), atol=1e-6)
         shares.append(is_sky.mean())
     assert max(shares) > 0.1
 
@@ -85,11 +69,11 @@ def test_true_depth_of_a_cell_is_that_at_its_center():
     y, x = np.mgrid[0:8, 0:12] + 0.5
     logs = 0.01 * y - 0.005 * x
     centers_y, centers_x = np.mgrid[0:2, 0:3] * 4.0 + 2.0
-    found = log_depths_at_cells(np.exp(logs))
+    found = samples.log_depths_at_cells(np.exp(logs))
     np.testing.assert_allclose(found, 0.01 * centers_y - 0.005 * centers_x, atol=1e-6)
     # A depth edge through the center: one of the two surfaces, never a depth between them.
     logs[:, 6:] += 1.0
-    assert np.abs(log_depths_at_cells(np.exp(logs))[:, 1] - found[:, 1] - 1.0).max() < 0.02
+    assert np.abs(samples.log_depths_at_cells(np.exp(logs))[:, 1] - found[:, 1] - 1.0).max() < 0.02
 
 
 def frames_of(images, capture):
@@ -105,14 +89,14 @@ def context_frames(sample, capture):
 def test_samples_show_each_frame_once_and_none_that_is_held_out(mix, capture):
     seen = set()
     for seed in range(12):
-        sample = capture_sample(VIEWS, mix, capture, [seed], SIZE)
+        sample = samples.capture_sample(VIEWS, mix, capture, [seed], SIZE)
         context, targets = context_frames(sample, capture), frames_of(sample.target_images, capture)
         used = context + targets
         assert len(set(used)) == len(used) == 2 * NARROW.stream.chunk_size + 3
         assert min(context) < min(targets) and max(targets) < max(context)
         seen |= set(used)
     held_out = {4, 12, 20}
-    assert held_out == set(range(NUM_FRAMES)) - set(learned_frames(capture))
+    assert held_out == set(range(NUM_FRAMES)) - set(samples.learned_frames(capture))
     assert not seen & held_out and len(seen) > NUM_FRAMES / 2
 
 
@@ -125,19 +109,19 @@ def test_no_two_samples_of_a_training_are_the_same():
 def test_a_folder_of_captures_is_a_group_of_all_of_them(tmp_path):
     for name in ("first", "second"):
         make_capture(tmp_path / "many" / name)
-    (group,) = open_mix([tmp_path / "many"], [], NARROW).groups
+    (group,) = samples.open_mix([tmp_path / "many"], [], NARROW).groups
     assert [capture.name for capture in group.captures] == ["first", "second"]
 
 
 def test_poses_and_depths_of_a_sample_have_one_scale(mix, capture):
-    sample = capture_sample(VIEWS, mix, capture, [5], SIZE)
+    sample = samples.capture_sample(VIEWS, mix, capture, [5], SIZE)
     np.testing.assert_allclose(np.asarray(sample.chunks.viewmats[0, 0]), np.eye(4), atol=1e-6)
     context = context_frames(sample, capture)
     centers = np.linalg.inv(np.asarray(sample.chunks.viewmats, np.float64).reshape(-1, 4, 4))[:, :3, 3]
     true = capture.camtoworlds[context][:, :3, 3]
     scales = np.linalg.norm(centers[1:], axis=1) / np.linalg.norm(true[1:] - true[0], axis=1)
     np.testing.assert_allclose(scales, scales[0], rtol=1e-4)
-    depths = log_depths_at_cells(np.stack([scales[0] * capture.depth(i) for i in context]))
+    depths = samples.log_depths_at_cells(np.stack([scales[0] * capture.depth(i) for i in context]))
     found = np.asarray(sample.log_depths).reshape(depths.shape)
     np.testing.assert_allclose(found, depths, atol=1e-4)
     near, far = float(sample.chunks.near[0]), float(sample.chunks.far[0])
@@ -148,24 +132,16 @@ def test_poses_and_depths_of_a_sample_have_one_scale(mix, capture):
     assert np.all(np.abs(errors) <= VIEWS.range_jitter + 1e-4) and np.abs(errors).min() > 1e-3
 
 
-def test_with_the_paper_recipe_voxels_have_the_units_of_the_capture(capture):
-    """Poses keep their lengths in every sample, so 0.04 is 0.04 of theirs, whatever the size of the scene."""
+def test_with_the_paper_recipe_poses_and_range_are_those_of_the_capture(capture):
+    """So voxels of 0.04 measure 0.04 of its units, whatever the size of the scene."""
     config, (phase,) = preset("paper"), RECIPES["paper"].phases
     views = dataclasses.replace(phase.samples, num_chunks=2, num_targets=2, sizes=(SIZE,))
-    for size in (1.0, 7.0):
-        frames = [dataclasses.replace(frame, camtoworld=frame.camtoworld.copy()) for frame in capture.frames]
-        for frame in frames:
-            frame.camtoworld[:3, 3] *= size
-        scaled = dataclasses.replace(capture, frames=tuple(frames))
-        mix = CaptureMix((CaptureGroup("room", 1.0, (scaled,)),), config)
-        sample = capture_sample(views, mix, scaled, [5], SIZE)
-        centers = np.linalg.inv(np.asarray(sample.chunks.viewmats, np.float64).reshape(-1, 4, 4))[:, :3, 3]
-        true = scaled.camtoworlds[context_frames(sample, scaled)][:, :3, 3]
-        moved = [np.linalg.norm(x - x[0], axis=1) for x in (centers, true)]
-        np.testing.assert_allclose(*moved, atol=1e-4)
-        known = mix.frame_of(scaled)
-        assert known.scale == 1.0 and config.memory.voxel_size == 0.04
-        np.testing.assert_allclose([sample.chunks.near[0], sample.chunks.far[0]], [known.near, known.far], rtol=1e-5)
+    mix = samples.CaptureMix((samples.CaptureGroup("room", 1.0, (capture,)),), config)
+    sample, known = samples.capture_sample(views, mix, capture, [5], SIZE), mix.frame_of(capture)
+    centers = np.linalg.inv(np.asarray(sample.chunks.viewmats, np.float64).reshape(-1, 4, 4))[:, :3, 3]
+    true = capture.camtoworlds[context_frames(sample, capture)][:, :3, 3]
+    np.testing.assert_allclose(*(np.linalg.norm(x - x[0], axis=1) for x in (centers, true)), atol=1e-4)
+    np.testing.assert_allclose([sample.chunks.near[0], sample.chunks.far[0]], [known.near, known.far], rtol=1e-5)
 
 
 def with_depth_maps(capture, has_depth):
@@ -181,7 +157,7 @@ def with_depth_maps(capture, has_depth):
 
 
 def test_frames_without_depth_have_unknown_depths(mix, capture):
-    sample = capture_sample(VIEWS, mix, with_depth_maps(capture, lambda i: False), [5], SIZE)
+    sample = samples.capture_sample(VIEWS, mix, with_depth_maps(capture, lambda i: False), [5], SIZE)
     assert np.isnan(np.asarray(sample.log_depths)).all()
     assert np.isfinite(np.asarray(sample.chunks.images)).all()
 
@@ -193,10 +169,10 @@ def test_masks_of_a_capture_are_masks_of_its_samples(capture):
     frames = tuple(dataclasses.replace(f, is_masked=i % 2 == 0) for i, f in enumerate(capture.frames))
     pixels = dataclasses.replace(capture.pixels, masks=masks)
     mix = mix_of(dataclasses.replace(capture, frames=frames, pixels=pixels), share=0.5)
-    samples = list(map(opened(VIEWS, mix), range(8), [0] * 8))
-    shares = [np.mean(sample.target_seen) for sample in samples]
+    drawn = list(map(opened(VIEWS, mix), range(8), [0] * 8))
+    shares = [np.mean(sample.target_seen) for sample in drawn]
     assert 1.0 in shares and min(shares) < 1
-    hidden = next(sample for sample in samples if not sample.chunks.seen.all())
+    hidden = next(sample for sample in drawn if not sample.chunks.seen.all())
     seen = np.concatenate([hidden.chunks.seen.reshape(-1, *SIZE), hidden.target_seen.reshape(-1, *SIZE)])
     for view in seen:
         assert view.all() or not view[6:14].any()
@@ -204,8 +180,8 @@ def test_masks_of_a_capture_are_masks_of_its_samples(capture):
 
 def test_steps_are_shared_as_asked(capture):
     other = dataclasses.replace(capture)
-    groups = (CaptureGroup("a", 0.2, (capture,)), CaptureGroup("b", 0.5, (other,)))
-    drawn = [CaptureMix(groups, NARROW).draw(np.random.default_rng([0, step])) for step in range(3000)]
+    groups = (samples.CaptureGroup("a", 0.2, (capture,)), samples.CaptureGroup("b", 0.5, (other,)))
+    drawn = [samples.CaptureMix(groups, NARROW).draw(np.random.default_rng([0, step])) for step in range(3000)]
     rates = [np.mean([x is source for x in drawn]) for source in (capture, other, None)]
     np.testing.assert_allclose(rates, (0.2, 0.5, 0.3), atol=0.03)
 
