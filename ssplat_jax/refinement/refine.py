@@ -42,6 +42,10 @@ from ssplat_jax.streaming.session import Exposures
 Images = Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w 3"]
 
 FINAL_RATE = 0.3  # fraction of the learning rates that is left at the last planned step; they decay geometrically
+WARM_UP = 16
+"""Steps in which the learning rates rise to their full values. Adam's first steps move all parameters that a few views
+tell of equally far, however small the gradient: at full rates 8 steps of the room lose 1.4 dB on views never shown, with
+this they gain 0.8."""
 PATIENCE = 3  # rounds of views without a better held-back error that end refinement: few pixels are held back
 FINE_TILE, FINE_PAIRS = 4, 2.0
 """A fine tile has a quarter of the pixels, most of which lie outside of Gaussians smaller than a pixel. With fewer than
@@ -98,7 +102,7 @@ class Progress:
             self.max_rows = row_capacity(self.state, self.key_views, planned, self.config)
         while self.num_steps < planned and not self.has_stopped_helping():
             start = time.perf_counter()
-            rate = np.float32(FINAL_RATE ** (self.num_steps / planned))
+            rate = np.float32(FINAL_RATE ** (self.num_steps / planned) * min(1.0, (self.num_steps + 1) / WARM_UP))
             step = _compiled(self.config, self.max_pairs, self.max_rows, self.tile)
             self.state, report = step(self.state, self.key_views, rate)
             self.losses.append(float(report.loss))  # waits, so that a step's time is that of its work

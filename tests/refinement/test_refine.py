@@ -280,6 +280,17 @@ def test_refinement_learns_a_scene_that_turns_its_colors_and_ends_on_one_that_fi
     assert report.stopped_early and report.num_steps == len(report.losses) < 40
 
 
+@pytest.mark.parametrize("steps", [1, 4, 8])
+def test_few_steps_spoil_no_good_scene(same_capacity, steps):
+    """The first steps of Adam are as large for a small gradient as for a large one, and few views tell of them."""
+    unseen, noise = cameras(shifts=(0.22,)), np.random.default_rng(3).normal(size=(NUM, 1, 3))
+    good = replace(scene(), sh=scene().sh + 0.1 * jnp.asarray(noise, jnp.float32))
+    refined, _ = refine(good, cameras(), photographs(), steps=steps, config=CONFIG)
+    drawn = (np.asarray(render(g, unseen, max_pairs=MAX_PAIRS).color)[0] for g in (scene(), good, refined))
+    truth, before, after = drawn
+    assert psnr(after, truth) > psnr(before, truth)
+
+
 def test_arguments_that_do_not_fit_are_refused():
     for changes in (
         {"images": jnp.zeros((NUM_VIEWS, HEIGHT, WIDTH + 1, 3))},
