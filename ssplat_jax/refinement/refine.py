@@ -44,7 +44,7 @@ Images = Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w
 FINAL_RATE = 0.3  # fraction of the learning rates that is left at the last planned step; they decay geometrically
 WARM_UP = 16
 """Steps in which the learning rates rise to their full values. Adam's first steps move all parameters that a few views
-tell of equally far, however small the gradient: at full rates 8 steps of the room lose 1.4 dB on views never shown, with
+tell of equally far, however small the gradient: at full rates 8 steps of the room lose 1.4 dB on unseen views, with
 this they gain 0.8."""
 PATIENCE = 3  # rounds of views without a better held-back error that end refinement: few pixels are held back
 FINE_TILE, FINE_PAIRS = 4, 2.0
