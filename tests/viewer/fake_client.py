@@ -2,46 +2,20 @@
 
 import contextlib
 import socket
-import time
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-import ssplat_jax as ss
-from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.streaming.scene_delta import SceneDelta
+from tests.scene_files.scene_fixture import scene
 
 
 def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
-
-
-def wait_for(answer, seconds=90.0):
-    """The first answer that is true."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        with contextlib.suppress(OSError):
-            if value := answer():
-                return value
-        time.sleep(0.1)
-    raise TimeoutError("nothing came")
-
-
-def scene(num_gaussians=50, size=1.0):
-    rng = np.random.default_rng(0)
-    values = {
-        "means": size * rng.uniform([-1, -1, 2], [1, 1, 4], (num_gaussians, 3)),
-        "quats": rng.normal(size=(num_gaussians, 4)),
-        "scales": size * rng.uniform(0.02, 0.2, (num_gaussians, 3)),
-        "opacities": rng.uniform(0.2, 0.9, num_gaussians),
-        "colors": rng.uniform(size=(num_gaussians, 3)),
-    }
-    return ss.Gaussians.from_rgb(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
 
 
 def frame(origin=(0.0, 0.0, 0.0)):
@@ -53,9 +27,7 @@ def frame(origin=(0.0, 0.0, 0.0)):
 
 def delta(rows, seed):
     """Changes of two Gaussians for each of some rows."""
-    rng, count = np.random.default_rng(seed), 2 * len(rows)
-    gaussians = replace(scene(count), opacities=jnp.asarray(rng.uniform(0.2, 0.9, count), jnp.float32))
-    return SceneDelta(np.asarray(rows, np.int32), gaussians, 8)
+    return SceneDelta(np.asarray(rows, np.int32), scene(0, 2 * len(rows), seed), 8)
 
 
 def header(stream=None, exposure=(1.0, 1.0, 1.0)):

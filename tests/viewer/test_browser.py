@@ -21,6 +21,8 @@ from tests.viewer.fake_client import FakeClient, delta, frame, free_port, header
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
 SIZE = (48, 32)
+FOCAL = 16 / np.tan(0.45)
+K = np.array([[FOCAL, 0, 24], [0, FOCAL, 16], [0, 0, 1]])
 LEVEL = 1 / 255
 
 
@@ -161,8 +163,6 @@ def walls(x, z, size, colors):
 
 def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
     viewed, at = walls([-0.6, 0.6], [2, 2.1], 0.6, [[0.9, 0.2, 0.1], [0.1, 0.3, 0.9]]), pose(0.1)
-    focal = 16 / np.tan(0.45)
-    K = np.array([[focal, 0, 24], [0, focal, 16], [0, 0, 1]])
     viewmats, Ks = (jnp.asarray(x, jnp.float32) for x in (np.linalg.inv(at), K))
     view = Camera(viewmats=viewmats, Ks=Ks, width=48, height=32)
     out = ss.render(viewed, view)
@@ -179,8 +179,6 @@ def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
 
 
 def test_depth_is_light_near_and_dark_far():
-    focal = 16 / np.tan(0.45)
-    K = np.array([[focal, 0, 24], [0, focal, 16], [0, 0, 1]])
     depth = draw(walls([-0.5, 0.5], [2, 4], 0.25, [[0.5] * 3] * 2), "depth", pose(), K, SIZE).astype(float)
     left, right = (slice(14, 18), slice(13, 17)), (slice(14, 18), slice(27, 30))
     assert depth[left].mean() > depth[right].mean() + 40 and (depth[:, 0] == 0).any()

@@ -18,14 +18,16 @@ from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_delta
 from ssplat_jax.viewer.stage import MAX_SIGMA, GrowingScene, SceneFile, Stage, median_size, open_source, visible_splats
 from ssplat_jax.viewer.view_scene import Viewer, import_viser
-from tests.viewer.fake_client import delta, frame, free_port, header, scene
+from tests.scene_files.scene_fixture import scene
+from tests.viewer.fake_client import delta, frame, free_port, header
 
 HALF_PRECISION = 2.0**-11  # relative rounding of a 16-bit float
 
 
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
 def test_splats_equal_the_gaussians_in_16_bits_at_any_size(size):
-    gaussians = scene(size=size)
+    gaussians = scene(0)
+    gaussians = replace(gaussians, means=size * gaussians.means, scales=size * gaussians.scales)
     unit = median_size(gaussians)
     splats = visible_splats(gaussians, unit, max_gaussians=1000)
     rotations = Rotation.from_quat(np.asarray(gaussians.quats)[:, [1, 2, 3, 0]]).as_matrix()
@@ -42,27 +44,27 @@ def test_splats_equal_the_gaussians_in_16_bits_at_any_size(size):
 
 
 def test_invisible_gaussians_are_dropped_and_huge_ones_cut():
-    gaussians = scene()
+    gaussians = scene(0)
     means = gaussians.means.at[0, 0].set(np.nan)
     scales = gaussians.scales.at[1].set(np.inf).at[2].set(1e6)
     opacities = gaussians.opacities.at[3].set(0.0).at[4].set(1 / 256)
     splats = visible_splats(
         replace(gaussians, means=means, scales=scales, opacities=opacities), 0.1, max_gaussians=1000
     )
-    assert len(splats["centers"]) == 50 - 4
+    assert len(splats["centers"]) == 60 - 4
     assert all(np.isfinite(x).all() for x in splats.values())
     assert np.isfinite(splats["covariances"].astype(np.float16)).all()
     np.testing.assert_allclose(np.linalg.eigvalsh(splats["covariances"][0]), MAX_SIGMA**2, rtol=1e-5)
 
 
 def test_too_many_gaussians_are_evenly_subsampled():
-    every, some = (visible_splats(scene(), 1.0, max_gaussians=most) for most in (50, 17))
+    every, some = (visible_splats(scene(0), 1.0, max_gaussians=most) for most in (60, 17))
     places = [int(np.flatnonzero((every["centers"] == center).all(axis=1))[0]) for center in some["centers"]]
-    assert len(places) == 17 and places[0] == 0 and places[-1] == 49
+    assert len(places) == 17 and places[0] == 0 and places[-1] == 59
     assert set(np.diff(places)) == {3, 4}
     growth = some["covariances"] / every["covariances"][places]
-    np.testing.assert_allclose(growth, 50 / 17, rtol=1e-5)  # as many times the area as there are times fewer
-    nothing = replace(scene(), opacities=jnp.zeros(50))
+    np.testing.assert_allclose(growth, 60 / 17, rtol=1e-5)  # as many times the area as there are times fewer
+    nothing = replace(scene(0), opacities=jnp.zeros(60))
     assert median_size(nothing) == 1.0 and len(visible_splats(nothing, 1.0, max_gaussians=10)["centers"]) == 0
 
 
@@ -89,17 +91,16 @@ def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
         path.unlink()
     save_delta(tmp_path / "deltas" / "000004.npz", deltas[1], stream)
     anew = source.changed()
-    assert anew is not None
     np.testing.assert_array_equal(np.asarray(anew.opacities) > 0, np.repeat([0, 1, 1, 0, 0, 1, 0, 0], 2) > 0)
 
 
 def test_a_run_that_has_been_refined_shows_its_refined_scene(tmp_path):
     source = GrowingScene(RunFolder(tmp_path))
     save_delta(tmp_path / "deltas" / "000004.npz", delta([0, 1], 1), header())
-    assert len(source.changed().means) != len(scene().means)
+    assert len(source.changed().means) != len(scene(0).means)
     for _ in range(2):  # written, and written anew
-        ss.save_ply(tmp_path / "refined.ply", scene())
-        assert len(source.changed().means) == len(scene().means) and source.changed() is None
+        ss.save_ply(tmp_path / "refined.ply", scene(0))
+        assert len(source.changed().means) == len(scene(0).means) and source.changed() is None
         (tmp_path / "refined.ply").unlink()
         assert source.changed() is None
 
@@ -126,7 +127,6 @@ def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeyp
     monkeypatch.setattr("ssplat_jax.viewer.stage.load_delta", vanish)
     assert source.changed() is None
     found = source.changed()
-    assert found is not None
     np.testing.assert_array_equal(found.opacities[:4], delta([0, 1], 1).gaussians.opacities)
     (tmp_path / "deltas" / "000012.npz").write_bytes(b"damaged")
     with pytest.raises(StorageError, match=r"000012\.npz"):
@@ -135,16 +135,16 @@ def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeyp
 
 def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     file = tmp_path / "scene.ply"
-    ss.save_ply(file, scene(5))
+    ss.save_ply(file, scene(0, 5))
     source = open_source(tmp_path)
     assert isinstance(source, SceneFile)
     assert source.changed().num_gaussians == 5 and source.changed() is None
-    ss.save_ply(file, scene(7))
+    ss.save_ply(file, scene(0, 7))
     assert source.changed().num_gaussians == 7
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])  # by a program that is still writing
     assert source.changed() is None
-    ss.save_ply(file, scene(6))
+    ss.save_ply(file, scene(0, 6))
     assert source.changed().num_gaussians == 6
     file.unlink()
     assert source.changed() is None  # shown on
@@ -153,13 +153,13 @@ def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
 def test_a_scene_stays_until_the_next_metrics_are_there(tmp_path):
     """A run that ends again removes its metrics, writes its scene, and then writes its metrics."""
     file, metrics = tmp_path / "scene.ply", tmp_path / "metrics.json"
-    ss.save_ply(file, scene(5))
+    ss.save_ply(file, scene(0, 5))
     metrics.write_text("{}")
     source = open_source(tmp_path)
     assert source.changed() is not None
     metrics.unlink()
     assert source.changed() is None
-    ss.save_ply(file, scene(7))
+    ss.save_ply(file, scene(0, 7))
     assert source.changed() is None
     metrics.write_text("{}")
     assert source.changed().num_gaussians == 7
@@ -173,7 +173,7 @@ def opened(path, max_gaussians=1000):
 
 def test_viewing_starts_where_the_scene_is_seen(tmp_path):
     """Before a lone file; at a run's first camera, or in the middle of its path; other files do not matter."""
-    ss.save_ply(tmp_path / "scene.ply", scene(5))
+    ss.save_ply(tmp_path / "scene.ply", scene(0, 5))
     metrics, far, folder = tmp_path / "metrics.json", frame((1e6, 2.0, 3.0)), RunFolder(tmp_path)
     assert far.offset[0] > 1e5
     for other in ("", "[]", '{"stream_frame": {"rotation": 1}}', "\x00"):
@@ -205,7 +205,7 @@ def test_viser_and_an_address_that_cannot_be_used_are_refused_at_once(monkeypatc
 
 def test_the_server_answers_at_its_url_and_prints_nothing(tmp_path, capsys):
     pytest.importorskip("viser")
-    ss.save_ply(tmp_path / "scene.ply", scene())
+    ss.save_ply(tmp_path / "scene.ply", scene(0))
     viewer = Viewer(opened(tmp_path), host="127.0.0.1", port=free_port())
     try:
         assert viewer.url.startswith("http://localhost:")
