@@ -1,5 +1,7 @@
 """Pictures of the inside of a box with textured walls, in NumPy: cheap, and with parallax in every direction."""
 
+import functools
+
 import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
@@ -21,12 +23,16 @@ def walk(num_frames, step=0.09):
     return poses
 
 
-def pictures(poses, seed=0):
+@functools.cache
+def walls():
+    return np.stack([texture(np.random.default_rng([0, face])) for face in range(6)])
+
+
+def pictures(poses):
     """Images (h, w, 3) of 8 bits; box corners and walls are seen from inside."""
-    walls = np.stack([texture(np.random.default_rng([seed, face])) for face in range(6)])
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = np.stack([(columns - WIDTH / 2) / FOCAL, (rows - HEIGHT / 2) / FOCAL, np.ones_like(rows)], -1)
-    return [_picture(walls, rays @ pose[:3, :3].T, pose[:3, 3]) for pose in poses]
+    return [_picture(walls(), rays @ pose[:3, :3].T, pose[:3, 3]) for pose in poses]
 
 
 def _picture(walls, directions, center):

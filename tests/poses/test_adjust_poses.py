@@ -16,32 +16,24 @@ NUM = 6
 CONTEXT = [i for i in range(NUM) if i != 4]
 
 
-def capture_of(poses, images):
-    frames = tuple(Frame(f"{i}.png", pose, K, WIDTH, HEIGHT) for i, pose in enumerate(poses))
-    pixels = ArrayPixels(images, np.zeros(images.shape[:3], np.float32))
-    return Capture("room", "test", frames, pixels, WIDTH, HEIGHT)
-
-
 @pytest.fixture(scope="module")
 def exact():
     poses = walk(NUM)
-    return capture_of(poses, np.stack(pictures(poses)).astype(np.float32) / 255)
+    frames = tuple(Frame(f"{i}.png", pose, K, WIDTH, HEIGHT) for i, pose in enumerate(poses))
+    images = np.stack(pictures(poses)).astype(np.float32) / 255
+    return Capture("room", "test", frames, ArrayPixels(images, np.zeros(images.shape[:3], np.float32)), WIDTH, HEIGHT)
 
 
-def with_wrong_poses(capture, seed=0):
-    rng, frames = np.random.default_rng(seed), list(capture.frames)
+@pytest.fixture(scope="module")
+def wrong(exact):
+    rng, frames = np.random.default_rng(0), list(exact.frames)
     for i in CONTEXT[1:]:
         turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         pose = frames[i].camtoworld.copy()
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(0.5) * turn).as_matrix()
         pose[:3, 3] += 0.02 * shift  # 1 % of the depth
         frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
-    return dataclasses.replace(capture, frames=tuple(frames))
-
-
-@pytest.fixture(scope="module")
-def wrong(exact):
-    return with_wrong_poses(exact)
+    return dataclasses.replace(exact, frames=tuple(frames))
 
 
 @pytest.fixture(scope="module")

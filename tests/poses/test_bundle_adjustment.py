@@ -1,4 +1,4 @@
-"""Bundle adjustment against dense float64 algebra, finite differences, and cameras whose poses are known."""
+"""Bundle adjustment of cameras whose poses are known."""
 
 import dataclasses
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.poses import bundle_adjustment as module
 from ssplat_jax.poses.bundle_adjustment import Observations, adjust, moved
 
 K = np.array([[260.0, 0, 160], [0, 250, 120], [0, 0, 1]])
@@ -76,24 +75,18 @@ def test_poses_stay_around_the_given_ones():
     assert np.degrees(drift.magnitude()) < 0.5 / np.sqrt(len(exact.Ks)) * 1.5
 
 
-def test_a_camera_without_observations_keeps_its_pose():
+@pytest.mark.parametrize("looks_away", [False, True])
+def test_a_camera_that_sees_no_point_keeps_its_pose(looks_away):
+    """Points behind a camera do not pull it."""
     exact, _ = scene()
     wrong = disturbed(exact)
-    kept = wrong.views != 3
-    parts = {name: getattr(wrong, name)[kept] for name in ("views", "points", "pixels")}
-    found = adjust(dataclasses.replace(wrong, **parts), SCALES, DEVIATIONS)
-    assert not found.twists[3].any() and found.twists[[2, 4]].all()
-
-
-def test_the_gradient_equals_finite_differences_of_the_cost():
-    seen = disturbed(scene(num_cameras=3, num_points=8, noise=1.0)[0])
-    prior = np.concatenate([np.tile(1 / np.repeat(np.square(DEVIATIONS), 3), 3), np.zeros(24)])
-    unknowns = np.concatenate([np.zeros(18), module._meeting_points(seen).ravel()])
-    normal, gradient = module._normal_equations(seen, unknowns, 1.5, prior)
-    steps = 1e-6 * np.eye(42)
-    ends = [[module._cost(seen, unknowns + sign * step, 1.5, prior) for step in steps] for sign in (-1, 1)]
-    np.testing.assert_allclose(gradient, np.subtract(ends[1], ends[0]) / 2e-6, rtol=1e-4, atol=1e-4)
-    assert np.linalg.eigvalsh(normal.toarray()).min() > 0
+    if looks_away:
+        wrong.viewmats[3] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ wrong.viewmats[3]
+    else:
+        parts = {name: getattr(wrong, name)[wrong.views != 3] for name in ("views", "points", "pixels")}
+        wrong = dataclasses.replace(wrong, **parts)
+    found = adjust(wrong, SCALES, DEVIATIONS)
+    assert np.abs(found.twists[3]).max() < 1e-9 and found.twists[[2, 4]].all()
 
 
 def test_points_of_parallel_rays_stay_finite():
@@ -103,15 +96,3 @@ def test_points_of_parallel_rays_stay_finite():
     same = dataclasses.replace(same, pixels=np.tile(seen.pixels[seen.views == 0], (2, 1)))
     found = adjust(same, SCALES, DEVIATIONS)
     assert np.isfinite(found.points).all() and np.abs(found.twists).max() < 1e-6
-
-
-def test_points_behind_cameras_have_a_constant_cost_and_no_pull():
-    seen, _ = scene(num_cameras=2, num_points=20)
-    behind = seen.viewmats.copy()
-    behind[1] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ behind[1]  # looks away
-    away = dataclasses.replace(seen, viewmats=behind)
-    points = scene(num_cameras=2, num_points=20)[1]
-    unknowns, prior = np.concatenate([np.zeros(12), points.ravel()]), np.ones(72)
-    cost = module._cost(away, unknowns, 1.0, np.zeros(72))
-    assert cost == pytest.approx(0.5 * 20 * module.HIDDEN_COST, abs=1e-6)
-    assert not module._normal_equations(away, unknowns, 1.0, prior)[1][6:12].any()

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from skimage.transform import estimate_transform
 
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
@@ -26,15 +27,6 @@ def estimate(source, out, overwrite=False, **options):
     return estimate_poses(source, out, PoseOptions(**options), overwrite, QUIET)
 
 
-def alike(points, wanted):
-    """Largest distance between points and others, after the similarity that moves them closest."""
-    a, b = points - points.mean(0), wanted - wanted.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation, scale = u @ np.diag(signs) @ vt, (s * signs).sum() / np.square(a).sum()
-    return np.linalg.norm(b - scale * a @ rotation.T, axis=1).max()
-
-
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
@@ -54,7 +46,9 @@ def test_cameras_are_found_up_to_a_similarity(estimated):
     capture, wanted = open_capture(out), walk(NUM_PHOTOS)
     assert [frame.name for frame in capture.frames] == [f"images/p_{i}.png" for i in range(NUM_PHOTOS)]
     assert found.registered == sorted(found.names) and 0 < found.reprojection_error < 0.5
-    assert alike(capture.camtoworlds[:, :3, 3], wanted[:, :3, 3]) < 0.02 * np.ptp(wanted[:, :3, 3], axis=0).max()
+    centers = capture.camtoworlds[:, :3, 3], wanted[:, :3, 3]
+    similarity = estimate_transform("similarity", *centers)
+    assert similarity.residuals(*centers).max() < 0.02 * np.ptp(centers[1], axis=0).max()
     turned = [np.einsum("ji,vjk->vik", poses[0, :3, :3], poses[:, :3, :3]) for poses in (capture.camtoworlds, wanted)]
     np.testing.assert_allclose(turned[0], turned[1], atol=0.02)  # radians since the first picture
     np.testing.assert_allclose(capture.K(0), K, atol=0.03 * FOCAL)
