@@ -1,13 +1,11 @@
 """Small captures in memory, and the stream frame of a capture's first camera."""
 
-import dataclasses
-
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.posed_image import Frame
 from ssplat_jax.data.stream_frame import StreamFrame
-from tests.badinputs.cases import rotated
 
 
 def smooth_capture(num_frames=6, height=48, width=64):
@@ -17,16 +15,12 @@ def smooth_capture(num_frames=6, height=48, width=64):
     depths = np.stack([1 + xs / width + i for i in range(num_frames)])
     frames, K = [], np.array([[60.0, 0, 30.0], [0, 61.0, 26.0], [0, 0, 1]])
     for i in range(num_frames):
-        pose = rotated(10.0 * i)
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("z", 10.0 * i, degrees=True).as_matrix()
         pose[:3, 3] = [0.3 * i, 0.05 * i, 0.1]
         frames.append(Frame(name=str(i), camtoworld=pose, K=K, width=width, height=height))
     pixels = ArrayPixels(images=images.astype(np.float32), depths=depths.astype(np.float32))
     return Capture(name="smooth", format="memory", frames=tuple(frames), pixels=pixels, width=width, height=height)
-
-
-def resized(capture, width, height):
-    """The same capture with another size of delivered images."""
-    return dataclasses.replace(capture, width=width, height=height)
 
 
 def frame_of(capture, scale=1.0):

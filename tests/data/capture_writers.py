@@ -198,24 +198,18 @@ def write_reality_capture(root):
     (root / "cameras.csv").write_text("\r\n".join(rows))
 
 
-def metashape_xml(matrices, *, kind="frame", lens="", before="", after=""):
-    """Cameras of one sensor, numbered from 0; `before` and `after` stand around them in their chunk."""
+def write_metashape(root):
     cameras = "".join(
         f'<camera id="{i}" sensor_id="0" component_id="0" label="{i}"><transform>{matrix_text(m)}</transform></camera>'
-        for i, m in enumerate(matrices)
+        for i, m in written(root, "images/{}.jpg")
     )
-    return (
+    text = (
         '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="c"><sensors><sensor id="0">'
-        f'<calibration type="{kind}" class="initial"><f>1</f></calibration><calibration type="{kind}" class="adjusted">'
+        '<calibration type="frame" class="initial"><f>1</f></calibration><calibration type="frame" class="adjusted">'
         f'<resolution width="{WIDTH}" height="{HEIGHT}"/><f>{FY}</f><b1>{FX - FY}</b1><cx>{CX - WIDTH / 2}</cx>'
-        f"<cy>{CY - HEIGHT / 2}</cy>{lens}</calibration></sensor></sensors>{before}<cameras>{cameras}</cameras>{after}"
-        "</chunk></document>"
+        f"<cy>{CY - HEIGHT / 2}</cy></calibration></sensor></sensors><cameras>{cameras}</cameras></chunk></document>"
     )
-
-
-def write_metashape(root):
-    matrices = [pose for _, pose in written(root, "images/{}.jpg")]
-    (root / "cameras.xml").write_text(metashape_xml(matrices))
+    (root / "cameras.xml").write_text(text)
 
 
 # Functions that change a capture that is written.

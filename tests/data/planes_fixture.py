@@ -1,5 +1,7 @@
 """Captures in memory of two textured planes, whose depth is known."""
 
+import functools
+
 import numpy as np
 from skimage.filters import gaussian
 from skimage.transform import resize
@@ -17,6 +19,20 @@ def texture(rng):
     return gaussian(sum(noise) / 3, 1.0, channel_axis=-1).astype(np.float32)
 
 
+@functools.cache
+def textures(number, seed):
+    rng = np.random.default_rng(seed)
+    return [texture(rng) for _ in range(number)]
+
+
+def on_plane(depth, colors, center, rays):
+    """What rays from a camera's center see of a textured plane: colors, their depths, and points."""
+    along = (depth - center[2]) / rays[..., 2]
+    hit = center + along[..., None] * rays
+    texel = np.floor((hit[..., :2] / (4 * depth) + 0.5) * 512).astype(int) % 512  # about one per pixel
+    return colors[texel[..., 1], texel[..., 0]], along, hit
+
+
 def two_planes(
     num_frames, step, *, forward=0.0, units=1.0, spin=0.0, seed=0, start=0.0, wall_at=FAR_PLANE, board_half=0.4
 ):
@@ -24,29 +40,19 @@ def two_planes(
 
     It sees a textured wall at depth `wall_at`, and before it a board at depth 2 of half side `board_half`.
     """
-    rng = np.random.default_rng(seed)
-    wall, board = texture(rng), texture(rng)
+    wall, board = textures(2, seed)
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(columns - WIDTH / 2) / FOCAL, (rows - HEIGHT / 2) / FOCAL, np.ones_like(rows)], -1)
+    directions = np.stack([(columns - WIDTH / 2) / FOCAL, (rows - HEIGHT / 2) / FOCAL, np.ones_like(rows)], -1)
     images, depths, frames = [], [], []
     for i in range(num_frames):
         c, s = np.cos(np.radians(spin * i)), np.sin(np.radians(spin * i))
         pose = np.array([[c, 0, s, start + step * i], [0, 1, 0, 0], [-s, 0, c, forward * i], [0, 0, 0, 1.0]])
-        world = rays @ pose[:3, :3].T
-        image, depth = None, None
-        for plane, colors in ((wall_at, wall), (NEAR_PLANE, board)):
-            extent = 4 * plane  # about one texel per pixel
-            along = (plane - pose[2, 3]) / world[..., 2]
-            hit = pose[:3, 3] + along[..., None] * world
-            texel = np.floor((hit[..., :2] / extent + 0.5) * 512).astype(int) % 512
-            shade = colors[texel[..., 1], texel[..., 0]]
-            if image is None:
-                image, depth = shade, along
-            else:
-                on_board = (np.abs(hit[..., :2]) < board_half).all(-1)
-                image, depth = np.where(on_board[..., None], shade, image), np.where(on_board, along, depth)
-        images.append(image)
-        depths.append(depth * units)
+        rays = directions @ pose[:3, :3].T
+        far_image, far, _ = on_plane(wall_at, wall, pose[:3, 3], rays)
+        near_image, near, hit = on_plane(NEAR_PLANE, board, pose[:3, 3], rays)
+        on_board = (np.abs(hit[..., :2]) < board_half).all(-1)
+        images.append(np.where(on_board[..., None], near_image, far_image))
+        depths.append(np.where(on_board, near, far) * units)
         pose[:3, 3] *= units
         K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
         frames.append(Frame(name=str(i), camtoworld=pose, K=K, width=WIDTH, height=HEIGHT))

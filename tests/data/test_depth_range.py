@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data import depth_range
-from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, stream_scale
 from ssplat_jax.data.open_capture import open_capture
@@ -64,30 +63,14 @@ def test_the_range_holds_a_distant_background_and_what_is_seen_over_short_baseli
 
 
 def test_only_the_given_frames_are_used():
-    """The targets of an evaluation must not influence near, far and scale."""
-    capture = two_planes(12, 0.05)
-    used = [0, 1, 2, 3, 5, 6, 7]
-    before = estimate_depths(capture, used)
-    assert isinstance(capture.pixels, ArrayPixels)
-    capture.pixels.images[4] = capture.pixels.images[8:] = np.nan
-    assert estimate_depths(capture, used) == before
-
-
-def test_a_diverged_camera_leaves_the_other_places_apart():
-    """Given or not; where it is not given, it changes nothing at all."""
-    capture = two_planes(9, 0.05)
-    before = estimate_depths(capture, range(8))
+    """The targets of an evaluation must not influence near, far and scale, and a diverged camera is apart if given."""
+    capture, used = two_planes(9, 0.05), [0, 1, 2, 3, 5, 6, 7]
+    before, truth = estimate_depths(capture, used), np.median(true_depths(capture, range(8)))
+    capture.pixels.images[4] = np.nan
     capture.frames[8].camtoworld[:3, 3] = MAX_COORDINATE
-    assert estimate_depths(capture, range(8)) == before
-    depths = estimate_depths(capture, range(9))
-    truth = np.median(true_depths(capture, range(9)))
+    assert estimate_depths(capture, used) == before
+    depths = estimate_depths(capture, [*used, 8])
     assert depths.source == "matches" and 1 / MEDIAN_TOLERANCE < depths.median / truth < MEDIAN_TOLERANCE
-
-
-@pytest.mark.parametrize("num_frames", [1, 3])
-def test_depth_without_motion_is_a_guess_of_one(num_frames):
-    depths = estimate_depths(two_planes(num_frames, 0.0), range(num_frames))
-    assert (depths.source, depths.median, depths.num_points) == ("baselines", 1.0, 0)
 
 
 @pytest.mark.parametrize("center", [[1.0, 2.0, 0.5], [0.0, 0.0, 0.0], [4.2e6, 6.1e5, 4.7e6]])
@@ -96,8 +79,9 @@ def test_rounding_of_poses_is_not_motion(center):
     capture, rng = two_planes(6, 0.0, spin=3.0), np.random.default_rng(0)
     for frame in capture.frames:
         frame.camtoworld[:3, 3] = np.array(center) * (1 + rng.uniform(-1e-15, 1e-15, 3)) + rng.uniform(-1e-16, 1e-16, 3)
-    depths = estimate_depths(capture, range(6))
-    assert (depths.source, depths.median) == ("baselines", 1.0)
+    for used in (range(6), [0]):  # a guess of one
+        depths = estimate_depths(capture, used)
+        assert (depths.source, depths.median, depths.num_points) == ("baselines", 1.0, 0)
     assert "one place" in summarize(capture, StreamConfig())["warnings"][-1]
 
 

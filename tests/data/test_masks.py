@@ -1,7 +1,6 @@
 """Masks: where they come from, and that what they hide gives no tokens, no exposure, no score and nothing to learn."""
 
 import dataclasses
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -9,24 +8,22 @@ import pytest
 from PIL import Image
 
 import ssplat_jax as ss
-from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import mean_color
-from ssplat_jax.data.capture import ArrayPixels, Capture
+from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.images import Lens, undistort
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.metrics import psnr, ssim
 from ssplat_jax.rasterizer import fill_holes
 from ssplat_jax.refinement.compared_views import RefineConfig, view_loss
 from ssplat_jax.refinement.refine import key_views_of
 from ssplat_jax.runs.capture_run import GrowingCapture
 from ssplat_jax.runs.stream_commands import Run
-from ssplat_jax.streaming.session import Exposures, Session, feed_capture
+from ssplat_jax.streaming.session import Session, feed_capture
 from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, another, frame, make_capture, opened, top
-from tests.data.capture_fixture import smooth_capture
+from tests.data.capture_fixture import frame_of, smooth_capture
 from tests.scene_files.scene_fixture import scene
 
 HIDDEN = np.zeros((HEIGHT, WIDTH), bool)
@@ -88,7 +85,7 @@ def test_masks_hide_pixels_of_some_images(mask, tmp_path):
     capture = opened(tmp_path, mask)
     np.testing.assert_array_equal(capture.seen(2), ~HIDDEN)
     assert capture.seen(1).all() and len(capture.notes) == 1
-    chunk = next(capture.chunks(StreamConfig(), range(4), stream_frame=capture.stream_frame(StreamConfig())))
+    chunk = next(capture.chunks(StreamConfig(), range(4), stream_frame=frame_of(capture)))
     np.testing.assert_array_equal(chunk.seen[2], ~HIDDEN)
     assert chunk.seen[:2].all()
     small = dataclasses.replace(capture, width=WIDTH // 2, height=HEIGHT // 2).seen(2)
@@ -99,7 +96,7 @@ def test_masks_of_no_image_are_counted_and_captures_without_masks_have_none(tmp_
     capture = opened(tmp_path, in_folder("another.png"))
     assert not capture.is_masked and capture.notes[0].startswith("1 files in masks/ are left out")
     assert capture.seen(0) is None
-    assert next(capture.chunks(StreamConfig(), stream_frame=capture.stream_frame(StreamConfig()))).seen is None
+    assert next(capture.chunks(StreamConfig(), range(4), stream_frame=frame_of(capture))).seen is None
 
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):
@@ -152,38 +149,21 @@ def test_scores_are_those_of_the_pixels_that_are_seen():
 
 # -- a room in which a sphere moves -----------------------------------------------------------------------------------
 
-MAGENTA = np.array([1.0, 0.0, 1.0], np.float32)
-NUM, WITH_SPHERE = 12, range(4, 9)
+NUM, WITH_SPHERE = 8, range(3, 6)
 
 
 def with_sphere(capture):
-    """The capture in which a magenta sphere moves through five frames, and where it covers them."""
+    """The capture in which a magenta sphere moves through three frames, and where it covers them."""
     images, covered = capture.pixels.images.copy(), np.zeros((NUM, capture.height, capture.width), bool)
     rows, columns = np.mgrid[: capture.height, : capture.width] + 0.5
     for i in WITH_SPHERE:
         K = capture.K(i)
         rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(rows)], axis=-1)
-        center = np.array([0.12 * (i - 6), 0.05, 0.9])
+        center = np.array([0.12 * (i - 4), 0.05, 0.9])
         along = rays @ center / np.linalg.norm(rays, axis=-1)
         covered[i] = center @ center - along**2 < 0.25**2
-        images[i][covered[i]] = MAGENTA
+        images[i][covered[i]] = [1.0, 0.0, 1.0]
     return images, covered
-
-
-class Streamed(NamedTuple):
-    capture: Capture
-    frame: StreamFrame
-    exposures: Exposures
-    colors: list  # of every third frame
-
-
-def streamed(capture, model, params) -> Streamed:
-    frame = capture.stream_frame(model.config)
-    session = Session(model, params)
-    exposures, _ = feed_capture(session, capture, range(NUM), frame)
-    gaussians, shown = session.gaussians(), range(0, NUM, 3)
-    colors = [np.asarray(drawn(gaussians, capture.camera(i, frame))) * exposures[i] for i in shown]
-    return Streamed(capture, frame, exposures, colors)
 
 
 @jax.jit
@@ -193,56 +173,54 @@ def drawn(gaussians, camera):
     return fill_holes(out.color, out.alpha, mean_color(gaussians))
 
 
-def magenta_share(colors) -> float:
-    """Share of the pixels that are drawn magenta."""
-    return float(np.mean([(c[..., 1] < 0.25) & (c[..., [0, 2]].min(axis=-1) > 0.5) for c in colors]))
-
-
 @pytest.fixture(scope="module")
-def scenes(programs_shared):
-    """The masks of the empty and the spoiled room hide nothing, so that one program streams all three."""
-    room = open_capture(f"procedural:room?frames={NUM}&size=96x64")
+def colors(programs_shared):
+    """Every third frame of the empty room, and as drawn after a stream of it, of the spoiled room and of a masked one.
+
+    The masks of the first two rooms hide nothing, so that one program streams all three.
+    """
+    room = open_capture(f"procedural:room?frames={NUM}&size=64x48")
     images, covered = with_sphere(room)
     frames = tuple(dataclasses.replace(f, is_masked=i in WITH_SPHERE) for i, f in enumerate(room.frames))
     model, params = ss.StreamSplat(ss.preset("tiny")), ss.load_params("tiny")
-    shown = {"empty": (room.pixels.images, ~covered | True), "spoiled": (images, ~covered | True)}
-    scenes = {}
-    for name, (pixels, seen) in (shown | {"masked": (images, ~covered)}).items():
+    colors = {"wanted": [room.image(i) for i in range(0, NUM, 3)]}
+    everywhere = np.ones_like(covered)
+    rooms = {"empty": (room.pixels.images, everywhere), "spoiled": (images, everywhere), "masked": (images, ~covered)}
+    for name, (pixels, seen) in rooms.items():
         capture = dataclasses.replace(room, frames=frames, pixels=ArrayPixels(pixels, room.pixels.depths, seen))
-        scenes[name] = streamed(capture, model, params)
-    return scenes
+        frame, session = capture.stream_frame(model.config), Session(model, params)
+        exposures, _ = feed_capture(session, capture, range(NUM), frame)
+        gaussians = session.gaussians()
+        colors[name] = [drawn(gaussians, capture.camera(i, frame)) * exposures[i] for i in range(0, NUM, 3)]
+    return {name: np.stack(x) for name, x in colors.items()}
 
 
-def test_a_masked_sphere_does_not_appear(scenes):
-    share = {name: magenta_share(scene.colors) for name, scene in scenes.items()}
+def test_a_masked_sphere_does_not_appear(colors):
+    """Few pixels are as magenta as it is."""
+    share = {name: np.mean((c[..., 1] < 0.25) & (c[..., [0, 2]].min(axis=-1) > 0.5)) for name, c in colors.items()}
     assert share["spoiled"] > 0.005
     assert share["masked"] <= share["empty"] + 1e-4, share
 
 
-def test_the_rest_of_a_masked_room_is_as_good_as_an_empty_one(scenes):
+def test_the_rest_of_a_masked_room_is_as_good_as_an_empty_one(colors):
     """Scored on the empty room's images; the spoiled room is clearly worse."""
-    images = [scenes["empty"].capture.image(i) for i in range(0, NUM, 3)]
-    scores = {name: np.mean([psnr(*pair) for pair in zip(s.colors, images, strict=True)]) for name, s in scenes.items()}
-    assert scores["masked"] > scores["empty"] - 2.0  # five frames show less of it
-    assert scores["spoiled"] < scores["masked"] - 0.5
-
-
-def test_refinement_compares_with_the_pixels_of_a_capture_that_are_seen(scenes):
-    capture, frame, exposures, _ = scenes["masked"]
-    views = key_views_of(capture, range(NUM), frame, exposures)
-    np.testing.assert_array_equal(views.seen, [capture.seen(i) for i in range(NUM)])
+    drawn, wanted = (colors[name] for name in ("empty", "spoiled", "masked")), colors["wanted"]
+    empty, spoiled, masked = (np.mean([psnr(*pair) for pair in zip(x, wanted, strict=True)]) for x in drawn)
+    assert masked > empty - 2.0  # three frames show less of it
+    assert spoiled < masked - 0.5
 
 
 def test_refinement_learns_nothing_from_masked_pixels():
     """Whatever the masked pixels hold, the errors that the scene follows are the same."""
-    capture = smooth_capture(1, 32, 32)
-    camera = jax.tree.map(lambda x: x[None], capture.camera(0))
-    seen = np.ones((1, 32, 32), bool)
+    capture, seen, losses = smooth_capture(1, 32, 32), np.ones((1, 32, 32), bool), []
     seen[0, :, :16] = False
+    frames = (dataclasses.replace(capture.frames[0], is_masked=True),)
     given, config = (scene(0, n=30), jax.numpy.zeros(3)), RefineConfig()
     loss = jax.jit(lambda view: view_loss(*given, view, jax.numpy.int32(0), config, 1 << 12)[0])
-    losses = []
     for hidden in (0.0, 1.0):
-        images = np.where(seen[..., None], capture.image(0)[None], np.float32(hidden))
-        losses.append(loss(KeyViews.of(camera, images, None, seen).at(0)))
+        images = np.where(seen[..., None], capture.pixels.images, np.float32(hidden))
+        masked = dataclasses.replace(capture, frames=frames, pixels=ArrayPixels(images, capture.pixels.depths, seen))
+        views = key_views_of(masked, [0], frame_of(masked), {0: np.ones(3)})
+        np.testing.assert_array_equal(views.seen, seen)
+        losses.append(loss(views.at(0)))
     assert losses[0] == losses[1] > 0

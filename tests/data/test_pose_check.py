@@ -1,11 +1,9 @@
 """Poses in another convention are recognised from the images, and read with the options that are named."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
@@ -13,6 +11,7 @@ from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import CONVENTIONS, USUAL, Convention, with_options
 from ssplat_jax.data.sparse_matches import fit_poses, keypoints_of, pose_warning
+from tests.badinputs.cases import make_capture
 from tests.data.planes_fixture import two_planes
 
 NAMES = [f"{c.axes}-{c.poses}" for c in CONVENTIONS]
@@ -57,17 +56,15 @@ def test_poses_of_other_images_are_found(room, keypoints):
 @pytest.mark.parametrize("written", CONVENTIONS, ids=NAMES)
 def test_options_of_the_path_read_files_in_any_convention(written, room, tmp_path):
     """As transforms.json, whose poses are camera-to-world with OpenGL axes."""
-    frames = []
-    for i, frame in enumerate(room.frames[:3]):
-        Image.fromarray((room.image(i) * 255).astype(np.uint8)).save(tmp_path / f"{i}.png")
-        frames.append({"file_path": f"{i}.png", "transform_matrix": written.from_opencv(frame.camtoworld).tolist()})
-    K = room.K(0)
-    meta = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    path = with_options(str(tmp_path), **written.options(Convention(axes="opengl")))
-    capture = open_capture(path)
-    np.testing.assert_allclose(capture.camtoworlds, room.camtoworlds[:3], atol=1e-9)
-    assert capture.convention == written and capture.name == tmp_path.name
+
+    def change(root, meta):
+        for frame, pose in zip(meta["frames"], room.camtoworlds, strict=False):
+            frame["transform_matrix"] = written.from_opencv(pose).tolist()
+
+    root = make_capture(tmp_path / "c", change)
+    capture = open_capture(with_options(str(root), **written.options(Convention(axes="opengl"))))
+    np.testing.assert_allclose(capture.camtoworlds, room.camtoworlds[: len(capture)], atol=1e-9)
+    assert capture.convention == written and capture.name == root.name
 
 
 def test_inspect_names_the_flag_and_says_nothing_of_depths_from_wrong_poses(room):

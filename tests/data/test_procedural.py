@@ -10,7 +10,7 @@ from ssplat_jax.data.procedural.scene import Finish, SceneBuilder, clearance, fa
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, sample_scene
 from ssplat_jax.data.procedural.textures import texture_library
 
-NUM_SEEDS = 16
+NUM_SEEDS = 10
 MARGIN = 1.02  # the low-resolution probe slightly misses the nearest and farthest points
 
 

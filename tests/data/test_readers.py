@@ -19,6 +19,7 @@ from tests.data.capture_writers import (
     WRITERS,
     K,
     camera_bytes,
+    edit_text,
     poses,
     remove,
     tum_line,
@@ -101,7 +102,7 @@ def test_colmap_cameras_that_no_image_uses_may_be_of_any_model(tmp_path):
         np.testing.assert_array_equal(open_capture(tmp_path / root).frames[0].K, K)
 
 
-LENS = (0.11, 0.02, 0.01, 0.03)
+LENS, DENOMINATOR = (0.11, 0.02, 0.01, 0.03), (0.04, 0.1, -0.05, 0.02)
 MODELS = (
     (0, "SIMPLE_PINHOLE", (FX, CX, CY), ""),
     (1, "PINHOLE", (FX, FY, CX, CY), ""),
@@ -109,7 +110,7 @@ MODELS = (
     (3, "RADIAL", (FX, CX, CY, 0.11, 0.02), "k1 k2"),
     (4, "OPENCV", (FX, FY, CX, CY, *LENS), "k1 k2 p1 p2"),
     (5, "OPENCV_FISHEYE", (FX, FY, CX, CY, *LENS), "k1 k2 k3 k4"),
-    (6, "FULL_OPENCV", (FX, FY, CX, CY, *LENS, 0.04, 0, 0, 0), "k1 k2 p1 p2 k3"),
+    (6, "FULL_OPENCV", (FX, FY, CX, CY, *LENS, *DENOMINATOR), "k1 k2 p1 p2 k3 d1 d2 d3"),
     (8, "SIMPLE_RADIAL_FISHEYE", (FX, CX, CY, 0.11), "k1"),
     (9, "RADIAL_FISHEYE", (FX, CX, CY, 0.11, 0.02), "k1 k2"),
     (15, "FISHEYE", (FX, FY, CX, CY), ""),
@@ -126,7 +127,7 @@ def test_colmap_camera_models_give_their_intrinsics(model, name, params, coeffic
         assert (frame.K[0, 0], frame.K[1, 1]) == (FX, FX if params[1] == CX else FY)
         assert (frame.K[0, 2], frame.K[1, 2]) == (CX, CY)
         found = {} if frame.lens is None else {k: v for k, v in vars(frame.lens).items() if v}
-        assert found == dict(zip(coefficients.split(), (*LENS, 0.04), strict=False))
+        assert found == dict(zip(coefficients.split(), (*LENS, *DENOMINATOR), strict=False))
         assert isinstance(frame.lens, FisheyeLens) == ("FISHEYE" in name)
 
 
@@ -180,14 +181,14 @@ def test_record3d_images_may_have_intrinsics_of_their_own(tmp_path):
         open_capture(tmp_path)
 
 
+def leave_one_image(root, model):
+    edit_text(f"{model}/images.txt", lambda text: "\n".join(text.split("\n")[:4]) + "\n")(root)  # two lines an image
+
+
 def test_a_larger_colmap_model_beside_the_one_that_is_read_is_named(tmp_path):
     write_colmap_text(tmp_path)
-    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "1")
-    lines = (tmp_path / "sparse" / "1" / "images.txt").read_text().splitlines()
-    (tmp_path / "sparse" / "0").mkdir()
-    (tmp_path / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:4]) + "\n")  # of two lines an image
-    cameras = (tmp_path / "sparse" / "1" / "cameras.txt").read_text()
-    (tmp_path / "sparse" / "0" / "cameras.txt").write_text(cameras)
+    write_colmap_text(tmp_path, sparse="sparse/1")
+    leave_one_image(tmp_path, "sparse/0")
     capture = open_capture(tmp_path)
     assert len(capture) == 1
     assert capture.notes == (
@@ -197,15 +198,14 @@ def test_a_larger_colmap_model_beside_the_one_that_is_read_is_named(tmp_path):
     (tmp_path / "sparse" / "1").rename(tmp_path / "sparse" / "1_old")  # never read, whatever it holds
     assert len(open_capture(tmp_path).notes) == 1
     (tmp_path / "sparse" / "1_old").rename(tmp_path / "sparse" / "1")
-    (tmp_path / "sparse" / "1" / "images.txt").write_text("\n".join(lines[:4]) + "\n")  # as many
+    leave_one_image(tmp_path, "sparse/1")  # as many
     assert len(open_capture(tmp_path).notes) == 1
 
 
 def test_a_capture_with_a_number_for_a_name_has_no_others_beside_it(tmp_path):
     write_colmap_text(tmp_path / "24", sparse=".")
     write_colmap_text(tmp_path / "25", sparse=".")
-    lines = (tmp_path / "24" / "images.txt").read_text().splitlines()
-    (tmp_path / "24" / "images.txt").write_text("\n".join(lines[:4]) + "\n")
+    leave_one_image(tmp_path, "24")
     assert len(open_capture(tmp_path / "24")) == 1
 
 
@@ -317,7 +317,14 @@ def colmap(root):
     (root / "sparse" / "1" / "images.txt").write_text("1 0.5 0.5 -0.5 0.5 2 3 -1 1 a.png\n\n")
 
 
-@pytest.mark.parametrize("write", [transforms, splat_cameras, polycam, record3d, llff, kitti, colmap])
+def reality_capture(root):
+    """A level camera (roll 0) that looks at the horizon has pitch 90, and heading 0 looks along +y."""
+    write_image(root / "images" / "a.png", 0, SIZE)
+    row = f"a.png,1,2,3,90,90,0,{FOCAL * 36 / 64},0,0,0,0,0,0,0,0"
+    (root / "cameras.csv").write_text(f"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\r\n{row}")
+
+
+@pytest.mark.parametrize("write", [transforms, splat_cameras, polycam, record3d, llff, kitti, colmap, reality_capture])
 def test_a_camera_sees_points_where_its_axes_say(write, tmp_path):
     capture = open_capture(write(tmp_path) or tmp_path)
     viewmat = np.linalg.inv(capture.camtoworlds[0])

@@ -53,7 +53,7 @@ def test_paper_laws(num_frames, context, targets, anchors):
 @pytest.mark.parametrize("num_frames", [6, 12, 24, 72, 73, 146, 366, 3000])
 def test_a_capture_of_any_length_has_a_split(protocol, num_frames):
     split = choose_split(protocol, num_frames, None, None)
-    assert len(split.context) == min(64, len(split.context)) and len(split.targets) >= 1
+    assert 1 <= len(split.context) <= 64 and len(split.targets) >= 1
     used = len(split.context) + len(split.targets)
     assert used >= min(73, num_frames)  # of a short capture every frame
     if protocol == "interleaved":
@@ -67,10 +67,7 @@ def test_the_scannet_protocol_is_the_papers():
     assert (split.context, split.targets) == (paper.context, paper.targets)
     assert split.context[:8] != tuple(sorted(split.context))[:8]  # the anchors come first
     assert not choose_split("paper", 2000, None, 24).keeps_order
-
-
-def test_a_short_scene_is_not_thinned_and_a_too_short_one_refused():
-    exact = choose_split("scannet", 64 + 24, None, 24)
+    exact = choose_split("scannet", 64 + 24, None, 24)  # a short scene is not thinned
     assert len(exact.targets) == 64 and sorted(exact.context + exact.targets) == list(range(88))
     with pytest.raises(InputError, match=r"wanted 64 targets and 24 other frames, got 87 frames"):
         choose_split("scannet", 87, None, 24)
@@ -84,13 +81,7 @@ def along_a_line(steps):
     return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=-1)
 
 
-def test_slow_video_is_interleaved_to_the_wanted_step():
-    order = interleave(along_a_line([0.01] * 23), list(range(100, 124)), chunk_size=4, step=0.03)
-    assert order[:12] == [100, 103, 106, 109, 101, 104, 107, 110, 102, 105, 108, 111]
-    assert order[12:16] == [112, 115, 118, 121]
-
-
-@pytest.mark.parametrize("num_chunks", [1, 2, 8, 30, MAX_INTERLEAVED_CHUNKS])
+@pytest.mark.parametrize("num_chunks", [1, 2, 3, 8, 30, MAX_INTERLEAVED_CHUNKS])
 def test_views_of_a_chunk_are_as_far_apart_as_asked_however_slow_the_video(num_chunks):
     centers = along_a_line([0.03 / num_chunks] * (8 * num_chunks - 1))
     chunks = centers[interleave(centers, list(range(8 * num_chunks)), 4, 0.03), 0].reshape(-1, 4)

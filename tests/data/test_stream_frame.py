@@ -1,10 +1,9 @@
-"""Stream frames: they can be inverted, and do not change what a camera sees."""
+"""Stream frames: points come back from them, and Gaussians look the same."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.core.rotations import sh_rotation
 from ssplat_jax.data.stream_frame import StreamFrame
 from tests.scene_files.scene_fixture import assert_turned, scene
 
@@ -14,13 +13,9 @@ FLOAT32_ROUNDING = 2e-6
 EARTH = np.array([4.2e6, 6.1e5, 4.7e6])  # earth-centered meters, where float32 has a spacing of 0.5 m
 
 
-def random_rotation(rng):
-    return Rotation.random(random_state=rng).as_matrix()
-
-
 def random_pose(rng, center):
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = random_rotation(rng), center
+    pose[:3, :3], pose[:3, 3] = Rotation.random(random_state=rng).as_matrix(), center
     return pose
 
 
@@ -28,23 +23,19 @@ def frame_at(pose, scale=1.7):
     return StreamFrame.at_camera(pose, scale=scale, near=0.5, far=8.0)
 
 
-def test_points_and_cameras_survive_a_round_trip():
+def test_points_survive_a_round_trip():
     rng = np.random.default_rng(0)
     frame = frame_at(random_pose(rng, EARTH))
     points = EARTH + rng.normal(size=(50, 3))
     back = frame.points_to_capture(frame.points_to_stream(points))
     np.testing.assert_allclose(back, points, rtol=0, atol=FLOAT64_ROUNDING * EARTH.max())
-    frame = frame_at(random_pose(rng, np.ones(3)))
-    poses = np.stack([random_pose(rng, rng.normal(size=3)) for _ in range(5)])
-    back = np.linalg.inv(frame.viewmats(poses).astype(np.float64))  # camera-to-stream: axes and centers of the cameras
-    np.testing.assert_allclose(frame.rotation @ back[:, :3, :3], poses[:, :3, :3], rtol=0, atol=FLOAT32_ROUNDING)
-    np.testing.assert_allclose(frame.points_to_capture(back[:, :3, 3]), poses[:, :3, 3], rtol=0, atol=FLOAT32_ROUNDING)
 
 
-def test_gaussians_in_the_capture_frame_are_the_same_ellipsoids_in_the_same_colors():
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gaussians_in_the_capture_frame_are_the_same_ellipsoids_in_the_same_colors(degree):
     rng = np.random.default_rng(5)
     frame = frame_at(random_pose(rng, np.array([3.0, -2.0, 1.0])), scale=0.4)
-    before = scene(3)
+    before = scene(degree)
     after = frame.gaussians_to_capture(before)
     means = np.asarray(after.means, np.float64)
     np.testing.assert_allclose(frame.points_to_stream(means), before.means, rtol=0, atol=4 * FLOAT32_ROUNDING)
@@ -60,12 +51,3 @@ def test_a_small_scene_far_from_the_origin_keeps_its_points():
     assert any(frame.offset) and np.abs(frame.origin - frame.offset).max() <= 0.5 / frame.scale
     means = np.asarray(frame.gaussians_to_capture(before, offset=frame.offset).means, np.float64) + frame.offset
     np.testing.assert_allclose(frame.points_to_stream(means), before.means, rtol=0, atol=4 * FLOAT32_ROUNDING)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_sh_rotation_is_orthogonal_and_a_homomorphism(degree):
-    rng = np.random.default_rng(7)
-    a, b = random_rotation(rng), random_rotation(rng)
-    mixing = sh_rotation(a, degree)
-    np.testing.assert_allclose(mixing @ mixing.T, np.eye((degree + 1) ** 2), rtol=0, atol=1e-11)
-    np.testing.assert_allclose(sh_rotation(a @ b, degree), mixing @ sh_rotation(b, degree), rtol=0, atol=1e-11)

@@ -1,7 +1,5 @@
 """The transforms.json reader: conventions, defaults, odd files, notes for the user."""
 
-import shutil
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,12 +10,18 @@ from ssplat_jax.data.posed_image import Convention
 from tests.badinputs.cases import HEIGHT, WIDTH, another, entry, frame, make_capture, opened, top
 
 
-def test_frames_stream_in_natural_order(tmp_path):
+def renamed(names):
+    """Gives the images other names."""
+
     def change(root, meta):
-        for i, name in enumerate(("10", "9", "2b", "2a")):
+        for i, name in enumerate(names):
             another(i, f"{name}.jpg", (root / "images" / f"{i}.jpg").rename)(root, meta)
 
-    names = [frame.name for frame in opened(tmp_path, change).frames]
+    return change
+
+
+def test_frames_stream_in_natural_order(tmp_path):
+    names = [frame.name for frame in opened(tmp_path, renamed(("10", "9", "2b", "2a"))).frames]
     assert names == ["images/2a.jpg", "images/2b.jpg", "images/9.jpg", "images/10.jpg"]
 
 
@@ -66,13 +70,7 @@ def test_the_longer_side_determines_the_shrink_factor(tmp_path, turned):
 
 def test_names_without_an_order_keep_the_order_of_the_file(tmp_path):
     """The camera path decides about the order for random names, or all left images before all right ones."""
-
-    def rename(root, meta):
-        for x, name in enumerate("cadb"):
-            another(x, f"{name}.jpg", (root / "images" / f"{x}.jpg").rename)(root, meta)
-            meta["frames"][x]["transform_matrix"][0][3] = float(x)
-
-    told = opened(tmp_path, rename)
+    told = opened(tmp_path, renamed("cadb"))
     assert [frame.name[7] for frame in told.frames] == list("cadb")
     assert any("file's order" in note for note in told.notes)
 
@@ -81,16 +79,14 @@ def test_frames_are_ordered_by_poses_in_their_own_convention(tmp_path):
     """An orbit with random names: read as camera-to-world, all of it stands in one place."""
     names, written = "qcxamzbktrdyovfjsgpe", Convention("opengl", "world-to-camera")
 
-    def rename(root, meta):
-        first = meta["frames"][0]["file_path"]
-        meta["frames"] = []
-        for i, name in enumerate(names):
-            shutil.copyfile(root / first, root / "images" / f"{name}.jpg")
+    def change(root, meta):
+        renamed(names)(root, meta)
+        for i in range(len(names)):
             pose = np.eye(4)
             pose[:3, :3] = Rotation.from_euler("y", 18 * i, degrees=True).as_matrix()
             pose[:3, 3] = -3 * pose[:3, 2]
-            entry = {"file_path": f"images/{name}.jpg", "transform_matrix": written.from_opencv(pose).tolist()}
-            meta["frames"].append(entry)
+            meta["frames"][i]["transform_matrix"] = written.from_opencv(pose).tolist()
 
-    capture = open_capture(f"{make_capture(tmp_path / 'c', rename)}?poses=world-to-camera")
+    root = make_capture(tmp_path / "c", change, num_frames=len(names))
+    capture = open_capture(f"{root}?poses=world-to-camera")
     assert [frame.name[7] for frame in capture.frames] == list(names)

@@ -11,7 +11,6 @@ from PIL import Image
 
 import ssplat_jax as ss
 from ssplat_jax.cache.state import init_cache
-from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import read_index
 from ssplat_jax.scene_files.formats import SCENE_READERS, save_gaussians
 from ssplat_jax.storage.chunk_records import load_delta, save_delta
@@ -19,7 +18,7 @@ from ssplat_jax.storage.files import read_tensors
 from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.storage.weights import load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import SceneDelta
-from tests.badinputs.cases import depth_map, make_capture
+from tests.badinputs.cases import depth_map, make_capture, read_capture
 from tests.data.capture_writers import WRITERS
 from tests.scene_files.scene_fixture import compressed_ply, scene
 from tests.storage.test_files import TENSORS, write_safetensors
@@ -29,13 +28,6 @@ from tests.streaming.narrow_model import NARROW
 class Parser(NamedTuple):
     write: Callable[[Path], Path]  # writes good files to a folder; returns the one to damage
     read: Callable[[Path], object]  # reads it again
-
-
-def read_capture(path: Path) -> None:
-    """Opens the capture of the folder and decodes everything in it."""
-    capture = open_capture(path)
-    for i in range(len(capture)):
-        capture.K(i), capture.image(i), capture.depth(i)
 
 
 def above(num_folders: int) -> Callable[[Path], None]:
@@ -56,6 +48,16 @@ def with_images(name: str) -> Callable[[Path], Path]:
     return write
 
 
+def saved(name: str, save: Callable[[Path], object]) -> Callable[[Path], Path]:
+    """Saves one file of that name."""
+
+    def write(root: Path) -> Path:
+        save(root / name)
+        return root / name
+
+    return write
+
+
 def with_format(kind: str, file: str) -> Callable[[Path], Path]:
     def write(root: Path) -> Path:
         WRITERS[kind](root)
@@ -64,49 +66,25 @@ def with_format(kind: str, file: str) -> Callable[[Path], Path]:
     return write
 
 
-def write_scene(suffix: str) -> Callable[[Path], Path]:
-    def write(root: Path) -> Path:
-        if suffix == ".compressed.ply":
-            (root / f"a{suffix}").write_bytes(compressed_ply(n=12))
-        else:
-            save_gaussians(root / f"a{suffix}", scene(1, n=12))
-        return root / f"a{suffix}"
-
-    return write
+def save_scene(file: Path) -> None:
+    if file.name.endswith(".compressed.ply"):
+        file.write_bytes(compressed_ply(n=12))
+    else:
+        save_gaussians(file, scene(1, n=12))
 
 
-def write_state(root: Path) -> Path:
-    save_state(root / "state.npz", init_cache(NARROW.replace(capacity=128)), {"done": 4})
-    return root / "state.npz"
+def save_empty(file: Path) -> None:
+    save_state(file, init_cache(NARROW.replace(capacity=128)), {"done": 4})
 
 
-def write_delta(root: Path) -> Path:
-    save_delta(root / "000004.npz", SceneDelta(np.arange(12, dtype=np.int32), scene(0, n=12), 128))
-    return root / "000004.npz"
+def save_change(file: Path) -> None:
+    save_delta(file, SceneDelta(np.arange(12, dtype=np.int32), scene(0, n=12), 128))
 
 
-def write_weights(root: Path) -> Path:
+def save_zeros(file: Path) -> None:
+    """Weights that are zero."""
     shapes = jax.eval_shape(ss.StreamSplat(NARROW).init, jax.random.key(0))
-    save_weights(root / "w.npz", jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), NARROW, provenance={})
-    return root / "w.npz"
-
-
-def write_json(name: str, value: object) -> Callable[[Path], Path]:
-    def write(root: Path) -> Path:
-        (root / name).write_text(json.dumps(value))
-        return root / name
-
-    return write
-
-
-def write_npz(root: Path) -> Path:
-    np.savez(root / "a.npz", **TENSORS)
-    return root / "a.npz"
-
-
-def write_tensors(root: Path) -> Path:
-    write_safetensors(root / "a.safetensors", TENSORS)
-    return root / "a.safetensors"
+    save_weights(file, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), NARROW, provenance={})
 
 
 CAPTURE_FILES = {
@@ -133,13 +111,13 @@ PARSERS = (
         for kind, files in CAPTURE_FILES.items()
         for file in files
     }
-    | {suffix: Parser(write_scene(suffix), ss.load_scene) for suffix in SCENE_READERS}
+    | {suffix: Parser(saved(f"a{suffix}", save_scene), ss.load_scene) for suffix in SCENE_READERS}
     | {
-        "stream state": Parser(write_state, load_state),
-        "delta": Parser(write_delta, load_delta),
-        "weights": Parser(write_weights, load_weights),
-        "index": Parser(write_json("index.json", INDEX), read_index),
-        "npz of tensors": Parser(write_npz, read_tensors),
-        "safetensors": Parser(write_tensors, read_tensors),
+        "stream state": Parser(saved("state.npz", save_empty), load_state),
+        "delta": Parser(saved("000004.npz", save_change), load_delta),
+        "weights": Parser(saved("w.npz", save_zeros), load_weights),
+        "index": Parser(saved("index.json", lambda file: file.write_text(json.dumps(INDEX))), read_index),
+        "npz of tensors": Parser(saved("a.npz", lambda file: np.savez(file, **TENSORS)), read_tensors),
+        "safetensors": Parser(saved("a.safetensors", lambda file: write_safetensors(file, TENSORS)), read_tensors),
     }
 )

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import gzip
 import io
-import itertools
 import json
 import math
 import random
@@ -64,6 +63,8 @@ def scene_for(degree: int = 3, n: int = 300) -> Gaussians:
 def assert_same(found: Gaussians, wanted: Gaussians, steps: Steps) -> None:
     """Each Gaussian of `wanted` is in `found`, in any order, within `steps`."""
     assert found.num_gaussians == wanted.num_gaussians and found.sh_degree == wanted.sh_degree
+    if not wanted.num_gaussians:
+        return
     found, wanted = ({name: np.asarray(getattr(x, name), np.float64) for name in FIELDS} for x in (found, wanted))
     order = KDTree(found["means"]).query(wanted["means"])[1]
     assert len(set(order)) == len(order)
@@ -78,27 +79,17 @@ def assert_same(found: Gaussians, wanted: Gaussians, steps: Steps) -> None:
 
 
 @pytest.mark.parametrize("suffix", BOTH_WAYS)
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_written_is_read_within_half_a_step(tmp_path, suffix, degree):
-    gaussians, path = scene_for(degree), tmp_path / f"a{suffix}"
+@pytest.mark.parametrize(("degree", "n"), [(0, 300), (1, 300), (2, 300), (3, 300), (3, 1), (0, 0)])
+def test_what_is_written_is_read_within_half_a_step(tmp_path, suffix, degree, n):
+    gaussians, path = scene_for(degree, n), tmp_path / f"a{suffix}"
     report = save_gaussians(path, gaussians)
-    assert (report.num_written, report.num_dropped) == (300, 0)
+    assert (report.num_written, report.num_dropped) == (n, 0)
     save_gaussians(tmp_path / f"again{suffix}", gaussians)
     assert path.read_bytes() == (tmp_path / f"again{suffix}").read_bytes()
     once = ss.load_scene(path)
     assert_same(once, gaussians, STEPS[suffix])
     save_gaussians(tmp_path / f"b{suffix}", once)
     assert_same(ss.load_scene(tmp_path / f"b{suffix}"), once, STEPS[suffix])
-
-
-@pytest.mark.parametrize("suffix", BOTH_WAYS)
-@pytest.mark.parametrize("n", [0, 1])
-def test_scenes_of_no_or_one_gaussian_are_held(tmp_path, suffix, n):
-    save_gaussians(tmp_path / f"a{suffix}", scene_for(n=n))
-    found = ss.load_scene(tmp_path / f"a{suffix}")
-    assert found.num_gaussians == n
-    if n:
-        assert_same(found, scene_for(n=1), STEPS[suffix])
 
 
 @pytest.mark.parametrize("suffix", BOTH_WAYS)
@@ -358,16 +349,6 @@ def test_a_palette_of_many_different_sh_is_fitted(tmp_path, monkeypatch):
     assert np.median(errors) < 0.02 and len(np.unique(np.asarray(found.sh[:, 1:]), axis=0)) <= 16
 
 
-def test_any_format_is_exported_from_any_other(tmp_path, capsys):
-    gaussians = scene_for(n=100)
-    ss.save_ply(tmp_path / "0.ply", gaussians, render_mode="default", offset=(0.0, 0.0, 1e7))
-    names = ["0.ply", "1.glb", "2.ply", "3.spz", "4.sog", "5.ply"]
-    for source, to in itertools.pairwise(names):
-        assert run("export", str(tmp_path / source), "--to", str(tmp_path / to)) == 0
-        said = capsys.readouterr()
-        assert "100 Gaussians" in said.out and ("[0.0, 0.0, 10000000.0]" in said.err) == (to in names[:4])
-    assert ss.load_scene(tmp_path / "2.ply").render_mode == "default"
-    losses = (dataclasses.astuple(STEPS[suffix]) for suffix in (".spz", ".sog"))
-    assert_same(ss.load_scene(tmp_path / "5.ply"), gaussians, Steps(*map(sum, zip(*losses, strict=True))))
+def test_a_format_that_is_not_written_is_refused_before_a_scene_is_read(tmp_path, capsys):
     assert run("export", str(tmp_path / "missing"), "--to", str(tmp_path / "scene.gltf")) == 2
     assert "*.ply, *.spz" in capsys.readouterr().err

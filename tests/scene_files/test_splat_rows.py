@@ -7,7 +7,6 @@ import pytest
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.scene_files.formats import load_ply, save_gaussians, save_ply
 from ssplat_jax.scene_files.splat_rows import rows_to_write, thinned_mask
-from tests.commands.command_fixture import run
 from tests.scene_files.scene_fixture import scene
 
 
@@ -30,6 +29,8 @@ def test_rows_that_no_viewer_shows_are_dropped_and_counted(tmp_path):
     report = save_ply(tmp_path / "a.ply", bad)
     assert (report.num_written, report.num_dropped) == (2, 8)
     np.testing.assert_array_equal(load_ply(tmp_path / "a.ply").means, good.means[8:])
+    report = save_gaussians(tmp_path / "b.ply", bad, max_splats=1)
+    assert (report.num_written, report.num_dropped, report.num_cut) == (1, 8, 1)
 
 
 @pytest.mark.parametrize("num_kept", [1, 7, 20, 49])
@@ -60,15 +61,3 @@ def test_thinning_takes_the_same_share_everywhere():
     assert all(abs(int(share.sum()) - 125) <= 2 for share in np.split(mask, 4)[:2]) and mask.sum() == 500
     in_a_quarter = mask[:400].reshape(20, 20)[:10, :10].sum()
     assert abs(int(in_a_quarter) - 125 / 4) <= 6
-
-
-def test_export_says_what_it_left_out(tmp_path, capsys):
-    gaussians = scene(0, n=50)
-    save_ply(tmp_path / "scene.ply", gaussians)
-    assert run("export", str(tmp_path / "scene.ply"), "--to", str(tmp_path / "a.ply"), "--max-splats", "30") == 0
-    assert "30 Gaussians (20 beyond --max-splats were left out)" in capsys.readouterr().out
-    hidden = replace(
-        gaussians, opacities=gaussians.opacities.at[:9].set(0.0), scales=gaussians.scales.at[9].set(jnp.nan)
-    )
-    report = save_gaussians(tmp_path / "b.ply", hidden, max_splats=30)
-    assert (report.num_written, report.num_dropped, report.num_cut) == (30, 10, 10)
