@@ -57,7 +57,8 @@ class StreamFrame:
     @staticmethod
     def from_dict(fields: dict[str, Any]) -> "StreamFrame":
         """The stream frame of the fields that `to_dict` gave."""
-        return StreamFrame(**fields | {name: np.array(fields[name]) for name in ("rotation", "origin")})
+        arrays: dict[str, Any] = {name: np.array(fields[name]) for name in ("rotation", "origin")}
+        return StreamFrame(**fields | arrays)
 
     def points_to_stream(self, points: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
         """Transforms points from the capture frame to the stream frame."""
