@@ -281,7 +281,7 @@ def test_refinement_learns_a_scene_that_turns_its_colors_and_ends_on_one_that_fi
 
 
 @pytest.mark.parametrize("steps", [1, 4, 8])
-def test_few_steps_spoil_no_good_scene(same_capacity, steps):
+def test_few_steps_spoil_no_good_scene(steps):
     """The first steps of Adam are as large for a small gradient as for a large one, and few views tell of them."""
     unseen, noise = cameras(shifts=(0.22,)), np.random.default_rng(3).normal(size=(NUM, 1, 3))
     good = replace(scene(), sh=scene().sh + 0.1 * jnp.asarray(noise, jnp.float32))
