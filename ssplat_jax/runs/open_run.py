@@ -254,7 +254,7 @@ def save_poses(folder: RunFolder, given: str, poses: Poses) -> None:
 
 
 def load_poses(folder: RunFolder) -> tuple[str, Poses] | None:
-    """What `save_poses` wrote to `folder`, or None.
+    """The digest and the poses that `save_poses` wrote to `folder`; None if there are none.
 
     Raises:
         StorageError: it is damaged.

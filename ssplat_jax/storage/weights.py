@@ -140,7 +140,7 @@ def changed_shares(params: dict, facts: WeightsFacts) -> dict[str, float]:
     for stage, part in start.items():
         if jax.tree.leaves(part):
             before, after = (np.asarray(ravel_pytree(x)[0], np.float64) for x in (part, params[stage]))
-            # What is left of `after` without its part along the start: 1 - cos^2 would cancel for small angles.
+            # `after` without its part along the start: 1 - cos^2 would cancel for small angles.
             across = after - (after @ before) / max(before @ before, 1e-300) * before
             shares[stage] = float(np.linalg.norm(across) / max(np.linalg.norm(after), 1e-300))
     return shares

@@ -142,7 +142,7 @@ class RenderingLoss:
         has_gains = self.fit_gains & sample.is_photographed
         gains = jnp.where(has_gains, fitted_gains(filled, targets), 1.0)
         weighted = ((1 - self.black_weight, filled * gains), (self.black_weight, black * gains))
-        # What has no weight is not computed: LPIPS takes long.
+        # LPIPS takes long: terms without weight are not computed.
         terms = [(weight, self.of_images(x, targets, lpips)) for weight, x in weighted if weight]
         shown, black = (jnp.mean((x - targets) ** 2) for _, x in weighted)
         return sum((weight * loss for weight, (loss, _) in terms), start=jnp.zeros(())), {

@@ -54,7 +54,7 @@ def read_capture(path: str | Path) -> Capture:
 
 
 def assert_refused(read: Callable[[Path], Any], path: Path, *words: str) -> None:
-    """What is read is refused in one line, which holds some words."""
+    """`read(path)` raises an `InputError` of one line that holds `words`."""
     with pytest.raises(InputError) as caught:
         read(path)
     message = str(caught.value)

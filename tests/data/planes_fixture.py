@@ -26,7 +26,7 @@ def textures(number, seed):
 
 
 def on_plane(depth, colors, center, rays):
-    """What rays from a camera's center see of a textured plane: colors, their depths, and points."""
+    """Colors, depths and points at which rays from a camera's center meet a textured plane."""
     along = (depth - center[2]) / rays[..., 2]
     hit = center + along[..., None] * rays
     texel = np.floor((hit[..., :2] / (4 * depth) + 0.5) * 512).astype(int) % 512  # about one per pixel

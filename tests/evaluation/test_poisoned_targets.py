@@ -29,11 +29,11 @@ def params():
     return random_params(FEW_GAUSSIANS)
 
 
-def poisoned(capture):
-    """The capture with targets of noise above and NaN below."""
-    images, targets = np.stack([capture.image(i) for i in range(len(capture))]), list(SPLIT.targets)
-    images[targets] = np.random.default_rng(3).uniform(size=images[targets].shape)
-    images[targets, capture.height // 2 :] = np.nan
+def poisoned(capture, frames, below):
+    """The capture with frames that are noise above and `below` in their lower half."""
+    images, frames = np.stack([capture.image(i) for i in range(len(capture))]), list(frames)
+    images[frames] = np.random.default_rng(3).uniform(size=images[frames].shape)
+    images[frames, capture.height // 2 :] = below
     depths = np.zeros(images.shape[:3], np.float32)
     return dataclasses.replace(capture, pixels=ArrayPixels(images.astype(np.float32), depths))
 
@@ -63,6 +63,15 @@ def evaluated(capture, params, causal, out, monkeypatch):
 @pytest.mark.parametrize("causal", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_poisoned_targets_change_nothing_but_scores(causal, capture, params, tmp_path, monkeypatch):
     facts, arrays = evaluated(capture, params, causal, tmp_path / "clean", monkeypatch)
-    got, there = evaluated(poisoned(capture), params, causal, tmp_path / "poisoned", monkeypatch)
+    other = poisoned(capture, SPLIT.targets, np.nan)
+    got, there = evaluated(other, params, causal, tmp_path / "poisoned", monkeypatch)
     assert got == facts
     assert_same_bits(there, arrays)
+
+
+@pytest.mark.slow
+def test_a_poisoned_context_view_is_noticed(capture, params, tmp_path, monkeypatch):
+    """The comparison above can fail."""
+    facts, _ = evaluated(capture, params, False, tmp_path / "clean", monkeypatch)
+    other = poisoned(capture, SPLIT.context[-1:], 0.5)
+    assert evaluated(other, params, False, tmp_path / "noise", monkeypatch)[0] != facts

@@ -39,3 +39,4 @@ def assert_same_bits(tree, expected, except_fields=()):
     for (name, x), (_, y) in zip(leaves_with_names(tree), leaves_with_names(expected), strict=True):
         if name.rpartition(".")[2] not in except_fields:
             np.testing.assert_array_equal(x, y, err_msg=name)
+            assert np.asarray(x).tobytes() == np.asarray(y).tobytes(), name  # 0 and -0 differ

@@ -170,7 +170,7 @@ def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
     found = draw(viewed, "color", at, K, SIZE)
     np.testing.assert_allclose(found / 255, wanted, atol=0.51 * LEVEL)
     assert found.min() > 0  # holes take the colors around them
-    # Of another shape: the same view, stretched. Means over 8 x 8 blocks of one are those over 4 x 8 of the other.
+    # A window of another shape shows the same view, stretched: its blocks of 4 x 8 are those of 8 x 8 before.
     narrow = draw(viewed, "color", at, np.diag([0.5, 1, 1]) @ K, (24, 32))
     blocks = [x.reshape(4, 8, 6, -1, 3).mean(axis=(1, 3)) / 255 for x in (found, narrow)]
     is_covered = np.asarray(out.alpha).reshape(4, 8, 6, 8).mean(axis=(1, 3)) > 0.8  # holes are filled by the pixel
