@@ -26,7 +26,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.pytree import pytree, replace
 
 MERGE_BLOCKS = ((512, 64), (16, 1))
-"""Pairs (voxels merged at a time, least number of voxels in a round for which that block size pays)."""
+"""Pairs (block size, least number of voxels in a round for which it pays)."""
 
 SAME_DIRECTION = 1.0 - 1e-6
 """Signed squared cosines above this are ties: if a frame is given twice, rounding must not choose the pair."""
@@ -40,7 +40,7 @@ class Plan:
     """The place of every token."""
 
     rows: Int[Array, " m"]  # -1 for tokens left out
-    slots: Int[Array, " m"]  # pivots and tokens that precede it in its row; from K on it merges
+    slots: Int[Array, " m"]  # number of pivots and tokens before it in its row; from K on the token merges
     leaders: Int[Array, " m"]  # the first token of the same row; used for merging only
     order: Int[Array, " m"]  # tokens sorted by row, in order of arrival within a row; used for merging only
 
@@ -68,7 +68,7 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
         A new pivot has observations of 0; those of merged pivots add up.
         Feature norms in [1e-9, 1e9]: outside, and for zero features, a pair counts as orthogonal.
         Two members of confidence 0 are averaged with equal weights.
-        A merged mean lies between its members, to the last bit, and so in their voxel.
+        A merged mean lies between its members, bit for bit, so it stays in their voxel.
     """
     cache, tokens = jax.lax.stop_gradient((cache, tokens))
     is_chunk = jnp.any(tokens.valid)
@@ -181,7 +181,7 @@ def _new_pivots(tokens: Tokens, cache: VoxelCache) -> Fields:
 
 
 def _merge_all(pivots: Fields, new: Fields, plan: Plan, config: StreamConfig) -> Fields:
-    """Merges the surplus tokens: round r takes the r-th one of every voxel, voxels with most of them first."""
+    """Merges tokens beyond K: round r takes each voxel's r-th such token, voxels with most of them first."""
     m, k = plan.order.shape[0], config.memory.pivots_per_voxel
     is_surplus = (plan.rows >= 0) & (plan.slots >= k)
     sizes = jnp.zeros((m,), jnp.int32).at[jnp.where(is_surplus, plan.leaders, m)].add(1, mode="drop")
@@ -254,7 +254,7 @@ def _merge_pair(older: Fields, newer: Fields) -> Fields:
     """Merged pivots (Eq. vacc_pair_selection_and_merge); `older` holds those of the lower slot."""
     weight_older, weight_newer = older["confidences"], newer["confidences"]
     newer_is_best = weight_newer > weight_older
-    # As the paper prints them: the true mean, by the number of members, gave 0.01 dB more on redkitchen, 0.04 on fox.
+    # The paper's weights. Weights by number of members gave 0.01 dB more on redkitchen, 0.04 on fox.
     total = weight_older + weight_newer
     share = jnp.where(total > 0, weight_newer / jnp.where(total > 0, total, 1.0), 0.5)
 
@@ -287,7 +287,7 @@ def _write(pivots: Fields, places: Int[Array, "*b"], values: Fields) -> Fields:
 def _unsigned(indices: Integer[Array, "*b"]) -> UInt32[Array, "*b"]:
     """`indices` for reading and writing; -1 becomes the largest number, which `mode="drop"` skips.
 
-    Each use of signed ones would wrap them with four operations of its own.
+    JAX wraps signed indices with four operations at each use; unsigned ones need none.
     """
     return indices.astype(jnp.uint32)
 

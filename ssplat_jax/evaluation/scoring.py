@@ -29,7 +29,8 @@ from ssplat_jax.evaluation.metrics import LPIPS_MIN_SIDE, SSIM_ARGUMENTS, LpipsW
 from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.poses.adjust_poses import adjust_and_say, check_look_ahead
 from ssplat_jax.rasterizer import effects_for, fill_holes, render
-from ssplat_jax.refinement import refine_on_capture
+from ssplat_jax.refinement.compared_views import FOR_CAPTURES
+from ssplat_jax.refinement.refine import Progress, key_views_of
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder, make_writable
 from ssplat_jax.streaming.session import Exposures, Session, begin_stream, feed_capture, middle_exposure
@@ -289,15 +290,11 @@ def evaluate(
     if refine_steps:
         before = score_targets(gaussians, capture, split.targets, stream_frame, exposures, lpips_weights)
         with reporter.progress("refining", refine_steps) as advance:
-            gaussians, report = refine_on_capture(
-                gaussians,
-                streamed,
-                split.context,
-                stream_frame,
-                exposures,
-                steps=refine_steps,
-                on_step=lambda step, loss: advance(step, f"loss {loss:.4f}"),
-            )
+            key_views = key_views_of(streamed, split.context, stream_frame, exposures)
+            progress = Progress.start(gaussians, key_views, FOR_CAPTURES)
+            for _ in progress.steps(refine_steps):
+                advance(progress.num_steps, f"loss {progress.losses[-1]:.4f}")
+        gaussians, report = progress.scene(gaussians), progress.report()
         cost["num_gaussians"] = int((gaussians.opacities > 0).sum())
         done = {name: value for name, value in vars(report).items() if name not in ("losses", "held_back")}
         refinement = {"refinement": done | {"before": before}}

@@ -132,7 +132,7 @@ class StreamSplat:
         Limits:
             Tokens that find no space are dropped and counted in `cache.stats.num_dropped`: call `ensure_capacity`
             before the step and `check_cache` after it. No gradient flows through the cache.
-            Inside jit, views with a camera or an image that cannot be used are left out as padding is, and counted in
+            Inside jit, views whose camera or image cannot be used are left out and counted in
             `cache.stats.num_unusable`; outside they are refused.
 
         Raises:
@@ -143,7 +143,7 @@ class StreamSplat:
         return self.update_cache(cache, prediction), prediction.output
 
     def update_cache(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
-        """The cache after a chunk: stored depths vote on its tokens, which are fused (VACC), and views on all pivots.
+        """The cache after a chunk: stored depths vote on its tokens, VACC fuses them, its views vote on all pivots.
 
         No gradient flows.
         """
@@ -158,8 +158,8 @@ class StreamSplat:
         # After fusion, so that views of one chunk that disagree lower the confidence of each other's pivots at once.
         with jax.named_scope("carve"):
             cells = seen_cells(output.depths, output.confidences, tokens.rgbs, self.config)
-            is_read = self.config.memory.carving or self.config.head.evidence
-            in_sight = rows_in_sight(cache, camera) if is_read else None
+            needs_sight = self.config.memory.carving or self.config.head.evidence
+            in_sight = rows_in_sight(cache, camera) if needs_sight else None
             cache = carve(cache, camera, cells, self.config, in_sight)
             cache = store_depths(cache, camera, cells)
         if cache.observations is None:
@@ -189,14 +189,14 @@ class StreamSplat:
     def decode_rows(
         self, params: dict, cache: VoxelCache, pivots: Int[Array, " m"], num_gaussians: int | None = None
     ) -> Gaussians:
-        """The Gaussians that `decode` gives for some pivots, at the cost of these alone.
+        """The Gaussians of some pivots, equal to those of `decode`; other pivots cost nothing.
 
         Args:
             params: the model's parameters.
             cache: the scene.
             pivots: numbers of pivots, voxel by voxel: pivot `k` of row `r` is `r * pivots_per_voxel + k`. The
                 Gaussians of -1 have opacity 0.
-            num_gaussians: leave out the rows that hold no Gaussian: the first so many that do, then rows of opacity 0.
+            num_gaussians: rows of the result. Rows with a Gaussian come first; rows of opacity 0 fill it up.
         """
         take = lambda x: x.reshape(-1, *x.shape[2:])[pivots]  # noqa: E731
         is_shown = (pivots >= 0) & take(shown_pivots(cache, self.config))
@@ -210,7 +210,7 @@ class StreamSplat:
         take: Callable[[Array], Array],
         num_gaussians: int | None = None,
     ) -> Gaussians:
-        """Gaussians of the pivots that `take` selects, all rows or those that hold one."""
+        """Gaussians of the pivots that `take` selects; with `num_gaussians` only the rows that hold one."""
         rgbs, stored, num_members = take(cache.rgbs), take(cache.footprints), take(cache.num_members)
         footprints = grown_footprints(stored, num_members, self.config)
         shapes = network_of(self.config).read_shapes(params["decoder"], take(cache.feats), self.config)

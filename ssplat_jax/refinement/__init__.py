@@ -11,6 +11,5 @@ from ssplat_jax.refinement.compared_views import RefineConfig as RefineConfig
 from ssplat_jax.refinement.online import online_refinement as online_refinement
 from ssplat_jax.refinement.refine import Refinement as Refinement
 from ssplat_jax.refinement.refine import refine as refine
-from ssplat_jax.refinement.refine import refine_on_capture as refine_on_capture
 from ssplat_jax.refinement.refine_step import init_refinement as init_refinement
 from ssplat_jax.refinement.refine_step import refine_step as refine_step

@@ -2,7 +2,7 @@
 
     Progress.start ─► Progress.steps: a step an iteration ─► Progress.scene, Progress.report
 
-`refine` runs all of it on given images, `refine_on_capture` on the frames of a stream.
+`refine` runs all of it on given images; `key_views_of` are the frames of a stream.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.render import TILE, count_pairs, round_up
 from ssplat_jax.refinement import compared_views
-from ssplat_jax.refinement.compared_views import FOR_CAPTURES, RefineConfig, only_usable, views_of_step
+from ssplat_jax.refinement.compared_views import RefineConfig, only_usable, views_of_step
 from ssplat_jax.refinement.refine_step import (
     RefineState,
     init_refinement,
@@ -43,13 +43,13 @@ Images = Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w
 
 FINAL_RATE = 0.3  # fraction of the learning rates that is left at the last planned step; they decay geometrically
 WARM_UP = 16
-"""Steps in which the learning rates rise to their full values. Adam's first steps move all parameters that a few views
-tell of equally far, however small the gradient: at full rates 8 steps of the room lose 1.4 dB on unseen views, with
-this they gain 0.8."""
+"""Steps in which the learning rates rise to their full values. Adam's first steps are equally long for all parameters,
+however small their gradients: eight steps of the room lose 1.4 dB on unseen views at full rates, and gain 0.8 dB with
+this."""
 PATIENCE = 3  # rounds of views without a better held-back error that end refinement: few pixels are held back
 FINE_TILE, FINE_PAIRS = 4, 2.0
-"""A fine tile has a quarter of the pixels, most of which lie outside of Gaussians smaller than a pixel. With fewer than
-twice the intersections it takes less time (redkitchen, 1.8 times: 0.6 of the time; Gaussians of a pixel, 2.3: 1.2)."""
+"""A fine tile has a quarter of the pixels. It pays below twice the intersections: 1.8 times (redkitchen) took 0.6 of
+the time, 2.3 times (Gaussians of a pixel) 1.2."""
 
 PAIRS_MARGIN = 1.25  # capacity for tile intersections over what the fullest view needs: Gaussians grow
 ROWS_MARGIN = 1.02  # capacity for rows over what the views of a step may see at most: Gaussians move
@@ -91,7 +91,7 @@ class Progress:
         return len(self.losses)
 
     def steps(self, planned: int) -> Iterator[None]:
-        """Takes a step an iteration, until `planned` are done or no longer help.
+        """Yields after each step, until `planned` steps are done or steps no longer help.
 
         The caller may save the progress after any iteration. A refinement that continues from it takes the same steps.
 
@@ -124,10 +124,9 @@ class Progress:
         return float(rounds[-PATIENCE:].min()) >= float(rounds[:-PATIENCE].min())
 
     def scene(self, given: Gaussians) -> Gaussians:
-        """`given`, the scene that refinement started from, as it is now.
+        """The refined scene. `given` is the scene that `start` got; its padding rows stay.
 
-        Gaussians whose opacity fell below what is drawn are absent, which changes no image; those that were as faint
-        before stay.
+        Gaussians that faded below 1/255 become absent, which changes no image; those that were as faint before stay.
         """
         return _scene_now(self.state.start, self.state.change, given)
 
@@ -200,39 +199,11 @@ def refine(
         InputError: shapes do not fit, `steps` is negative, images are out of range, or no view can be learned from.
     """
     _check(cameras, images, exposures)
-    return _refined(gaussians, KeyViews.of(cameras, images, exposures), steps, config or RefineConfig(), on_step)
-
-
-def refine_on_capture(
-    gaussians: Gaussians,
-    capture: Capture,
-    indices: Sequence[int],
-    stream_frame: StreamFrame,
-    exposures: Exposures,
-    *,
-    steps: int,
-    config: RefineConfig = FOR_CAPTURES,
-    on_step: Callable[[int, float], None] = lambda step, loss: None,
-) -> tuple[Gaussians, Refinement]:
-    """The decoded scene of a stream, in the stream frame, changed to fit its own frames.
-
-    Arguments are those of `key_views_of` and `refine`, with a configuration for captures.
-    """
-    return _refined(gaussians, key_views_of(capture, indices, stream_frame, exposures), steps, config, on_step)
-
-
-def _refined(
-    gaussians: Gaussians,
-    key_views: KeyViews,
-    steps: int,
-    config: RefineConfig,
-    on_step: Callable[[int, float], None],
-) -> tuple[Gaussians, Refinement]:
     if steps < 0:
         raise InputError(f"refine: steps must be at least 0, got {steps}.")
     if steps == 0:
         return gaussians, Refinement()
-    progress = Progress.start(gaussians, key_views, config)
+    progress = Progress.start(gaussians, KeyViews.of(cameras, images, exposures), config or RefineConfig())
     for _ in progress.steps(steps):
         on_step(progress.num_steps, progress.losses[-1])
     return progress.scene(gaussians), progress.report()
@@ -299,7 +270,7 @@ def key_views_of(capture: Capture, indices: Sequence[int], stream_frame: StreamF
     pixels = np.stack(images)
     if seen:
         pixels = np.concatenate([pixels, np.stack(seen)[..., None].astype(np.uint8)], axis=-1)
-    # Put on the device as they are: `KeyViews.of` compiles a program for each operation.
+    # Not `KeyViews.of`, which compiles a program for each operation.
     arrays = {"images": pixels, "viewmats": cameras.viewmats, "Ks": cameras.Ks, "exposures": factors}
     return KeyViews(**jax.device_put(arrays | {"valid": np.ones(len(used), bool)}))
 

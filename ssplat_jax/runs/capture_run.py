@@ -32,8 +32,8 @@ POLL_SECONDS = 0.25  # seconds between two looks at a folder that is still being
 def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Reporter) -> int:
     """Streams a capture into a folder, continuing the run that the folder holds, and says so; returns the exit code.
 
-    Every image is decoded once, when its chunk is due. A damaged one stops the stream there, with what came before it
-    saved; once it is mended, the run continues.
+    Images are decoded when their chunks are due; those that the depth range was read from are not decoded again. A
+    damaged one stops the stream there, with what came before it saved; once it is mended, the run continues.
 
     Args:
         model: the model to run; with a causal configuration if the capture is still being written.

@@ -30,9 +30,8 @@ from ssplat_jax.streaming.live_views import LiveViews, widen_range
 
 INITIAL_CHUNKS = 4  # a new cache has capacity for this many chunks in which every token opens a voxel
 
-NEW_SHARE, MOST_ROWS = 0.75, 1 << 17
-"""Share of a stream's tokens for which its cache has capacity from the start, since others meet a voxel that is there,
-and the most rows of such a cache: a step takes longer with unused ones."""
+NEW_SHARE = 0.75  # share of a stream's tokens for which the first cache has rows: others meet a voxel that is there
+MOST_ROWS = 1 << 17  # rows of a first cache; unused rows slow a step
 
 MIN_DECODED_PIVOTS = 1 << 15
 """Least number of pivots decoded at once: with fewer, compiling for a growing scene costs more than it saves."""
@@ -64,12 +63,13 @@ class Session:
     ) -> None:
         self.model, self.params, self.cache = model, params, cache
         self._live, self._refine_chunk = LiveViews(model.config, stream_frame), refine
-        self.least_decoded = MIN_DECODED_PIVOTS  # pivots; who decodes a growing scene often may raise it
+        self.least_decoded = MIN_DECODED_PIVOTS  # pivots; callers that often decode a growing scene raise it
         self.expected_chunks = INITIAL_CHUNKS  # of the stream, as far as the caller knows; sets the first capacity
         self.compile_seconds, self.num_compilations = 0.0, 0  # seconds that the stream waited for its programs
-        # Programs by what they compute and the shapes that they are compiled for; those of the last chunk.
+        # Compiled programs by name and shapes.
         self._programs: dict[tuple, jax.stages.Compiled] = {}
         self._ahead: dict[tuple, Future[jax.stages.Compiled]] = {}  # what `compile_ahead` has begun
+        # Programs that the last chunk ran.
         self._step: jax.stages.Compiled | None = None
         self._refine: jax.stages.Compiled | None = None
 
@@ -78,8 +78,8 @@ class Session:
     ) -> None:
         """Begins to compile the step of a new stream on another thread, while the caller prepares its first chunk.
 
-        A first chunk of other shapes compiles its own step. Nothing begins for a session that has a cache, whose shape
-        the stream continues, or that refines while it streams, since refinement adds arrays to the cache.
+        A first chunk of other shapes compiles its own step. Nothing begins for a session that has a cache, or that
+        refines while it streams: its shapes are others.
 
         Args:
             width: of the images, pixels.
@@ -110,10 +110,10 @@ class Session:
         cache = jax.eval_shape(functools.partial(init_cache, config, capacity))
         key = _program_key("step", cache, chunk)
         if key not in self._programs:
-            with_one_thread = ThreadPoolExecutor(1)
+            pool = ThreadPoolExecutor(1)
             program = Kept(self.model.step, donate_argnums=(1,)).program
-            self._ahead[key] = with_one_thread.submit(program, self.params, cache, chunk)
-            with_one_thread.shutdown(wait=False)
+            self._ahead[key] = pool.submit(program, self.params, cache, chunk)
+            pool.shutdown(wait=False)
 
     def feed(self, chunk: Chunk) -> ChunkOutput:
         """Streams one chunk into the cache and waits until it is done.
@@ -160,8 +160,8 @@ class Session:
     def flush(self) -> ChunkOutput | None:
         """Streams the views that wait for their chunk, however few, padded with invalid ones; None if none wait.
 
-        More than a chunk waits if an error or an interrupt came before an earlier one was made; the summary is that of
-        the last chunk. A single view cannot be matched; its depth comes from the cache alone. Views may be pushed
+        After an error or an interrupt several chunks may wait: all are streamed, and the last summary is returned. A
+        single view has no other view to match; only with HPDA does its depth come from the cache. Views may be pushed
         afterwards.
         """
         output = None
@@ -170,8 +170,8 @@ class Session:
         return output
 
     def _stream(self, chunk: Chunk, *, is_live: bool) -> ChunkOutput:
-        """Streams a chunk; the views of a live one no longer wait once it is on its way."""
-        check_chunk(chunk, self.model.config.stream.chunk_size)  # with its values, which the program cannot refuse
+        """Streams a chunk. The views of a live chunk leave the queue once its step is dispatched."""
+        check_chunk(chunk, self.model.config.stream.chunk_size)  # here, because nothing can be raised inside jit
         config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
         cache = self.cache
         if cache is None:
@@ -182,7 +182,7 @@ class Session:
             got = f"steps_per_chunk={config.stream.steps_per_chunk} and refine={self._refine_chunk}"
             raise refusal("Session", wanted=wanted, got=got, fix="call online_refinement with the session's model")
         if self._refine_chunk is not None:  # adds the key-view buffers if the cache lacks them
-            # Once a view had a mask, key views hold one each.
+            # After the first masked chunk every key view stores a mask, so this chunk needs one too.
             if chunk.seen is None and cache.key_views is not None and cache.key_views.seen is not None:
                 chunk = replace(chunk, seen=jnp.ones(chunk.images.shape[:3], bool))
             is_masked = chunk.seen is not None
@@ -192,8 +192,8 @@ class Session:
         if self._refine_chunk is not None:
             summary = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), step.out_info[1])
             refine = self._program("refine", self._refine_chunk, cache, chunk, summary)
-        # Dispatch every program before blocking on a result. A program takes the old cache when it starts, so the new
-        # one is kept at once: an interrupt of the wait costs nothing.
+        # Dispatch every program before blocking on a result. The step consumes the old cache; the new one is stored
+        # before the wait, so an interrupt loses nothing.
         self._step, self._refine = step, refine
         self.cache, out = step(self.params, cache, chunk)
         if is_live:
@@ -224,7 +224,7 @@ class Session:
     def gaussians(self) -> Gaussians:
         """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0.
 
-        With `detail` the rows that hold no Gaussian are left out.
+        With `detail`, rows without a Gaussian are skipped; padding rows still follow.
         """
         return self.decode_program()(self.params, self._present_cache())
 
@@ -248,7 +248,7 @@ class Session:
         return self._programs[key]
 
     def _present_cache(self) -> VoxelCache:
-        """The cache, or an empty one before the first chunk: `push` tells by an unset cache that nothing came yet."""
+        """The cache, or an empty one before the first chunk. `self.cache` stays None, which `push` asks for."""
         return self.model.init_cache() if self.cache is None else self.cache
 
     @property
@@ -316,7 +316,7 @@ def tokens_per_chunk(chunk: Chunk, size_multiple: int) -> int:
 def starting_capacity(config: StreamConfig, num_tokens: int, num_chunks: int = INITIAL_CHUNKS) -> int:
     """Capacity of a new cache: the configured one; under `grow` raised to a power of two that fits the stream.
 
-    Each capacity is another program of the step, so that growing is left to long streams.
+    Growing compiles the step again, so only long streams should need to grow.
     """
     if config.memory.overflow != "grow":
         return config.memory.capacity
