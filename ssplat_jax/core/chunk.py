@@ -37,7 +37,7 @@ class Chunk:
 
 
 def check_images(images: object, where: str) -> None:
-    """Checks images on the host. This is the one check of every image that people give.
+    """Checks images on the host. The step, `push` and refinement share it.
 
     Raises:
         InputError: the values are no floats, not finite, or outside [0, 1].

@@ -56,7 +56,8 @@ class Pixels(Protocol):
 class FilePixels:
     """Images and depth maps that are decoded from files and undistorted.
 
-    A decoded image is kept until it is asked for again: the depth range looks at some images before they stream.
+    While there is room, a decoded image is kept for its next use: to stream after the depth range, or to be pictured.
+    A use after that decodes it again. Masks and depth maps are never kept.
     """
 
     frames: Sequence[Frame]

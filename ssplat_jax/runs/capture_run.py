@@ -32,8 +32,8 @@ POLL_SECONDS = 0.25  # seconds between two looks at a folder that is still being
 def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Reporter) -> int:
     """Streams a capture into a folder, continuing the run that the folder holds, and says so; returns the exit code.
 
-    Images are decoded when their chunks are due; those that the depth range was read from are not decoded again. A
-    damaged one stops the stream there, with what came before it saved; once it is mended, the run continues.
+    Images are decoded when their chunks are due, and kept from the depth range on while they fit in memory. A damaged
+    one stops the stream there, with what came before it saved; once it is mended, the run continues.
 
     Args:
         model: the model to run; with a causal configuration if the capture is still being written.
@@ -53,9 +53,9 @@ def run_capture(model: StreamSplat, params: dict, options: Run, reporter: Report
         indices = source.indices
     else:
         source = GrowingCapture(options, reporter)
-        chunk_size, state, num_saved = model.config.stream.chunk_size, RunFolder(options.out), 0
-        if state.has_state() and not options.overwrite:
-            num_saved = load_newest_state(state.state)[1]["done"]
+        chunk_size, folder, num_saved = model.config.stream.chunk_size, RunFolder(options.out), 0
+        if folder.has_state() and not options.overwrite:
+            num_saved = load_newest_state(folder.state)[1]["done"]
         if received := source.wait_for(max(num_saved, chunk_size)):
             return stopped(received, f"after {num_saved} views", overwrites=options.overwrite)
         indices = source.indices[: num_saved or chunk_size]

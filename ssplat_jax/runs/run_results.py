@@ -187,7 +187,7 @@ def report_run(
         f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {film}    # a film",
         f"ssplat export {out} --to scene.sog{weights}    # for other viewers, at an eighth of the size",
     ]
-    _save(
+    _write_report(
         folder,
         metrics,
         [(folder.view(score["frame"]), _caption(score, "streamed")) for score in scores],
@@ -213,7 +213,7 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
     ]
     if refined := metrics.get("refinement"):
         facts.append(("PSNR as shown, before refinement", f"{refined['before']['shown']['psnr']:.2f} dB"))
-    _save(
+    _write_report(
         folder,
         metrics,
         [(folder.target(score["frame"]), _caption(score, "unseen")) for score in metrics["per_view"]],
@@ -224,7 +224,7 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
     )
 
 
-def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path, str]], **parts: Any) -> None:
+def _write_report(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path, str]], **parts: Any) -> None:
     """Writes a page with these pictures and further parts."""
     found = metrics | metrics["cache"] | metrics["stream_frame"]
     figures = {name.replace("_", " "): x for name, x in found.items() if isinstance(x, str | int | float)}

@@ -1,6 +1,7 @@
 """The commands that stream a capture, `ssplat run`, `refine`, `eval` and `demo`, `ssplat render`, and shared options.
 
-Nothing here imports JAX before a command runs.
+They stand here and not in `commands/`, because the functions of this package take them as their options. Nothing here
+imports JAX before a command runs.
 """
 
 import dataclasses

@@ -70,8 +70,8 @@ class Session:
         self._programs: dict[tuple, jax.stages.Compiled] = {}
         self._ahead: dict[tuple, Future[jax.stages.Compiled]] = {}  # what `compile_ahead` has begun
         # Programs that the last chunk ran.
-        self._step: jax.stages.Compiled | None = None
-        self._refine: jax.stages.Compiled | None = None
+        self._step_program: jax.stages.Compiled | None = None
+        self._refine_program: jax.stages.Compiled | None = None
 
     def compile_ahead(
         self, width: int, height: int, num_views: int, *, is_masked: bool = False, brings_depth: bool = False
@@ -194,7 +194,7 @@ class Session:
             refine = self._program("refine", self._refine_chunk, cache, chunk, summary)
         # Dispatch every program before blocking on a result. The step consumes the old cache; the new one is stored
         # before the wait, so an interrupt loses nothing.
-        self._step, self._refine = step, refine
+        self._step_program, self._refine_program = step, refine
         self.cache, out = step(self.params, cache, chunk)
         if is_live:
             self._live.drop(out)
@@ -254,12 +254,12 @@ class Session:
     @property
     def step_memory_bytes(self) -> int | None:
         """Memory of the compiled step, by XLA's analysis: arguments, results and temporaries; None if unknown."""
-        return _memory_bytes(self._step)
+        return _memory_bytes(self._step_program)
 
     @property
     def refine_memory_bytes(self) -> int | None:
         """Memory of the compiled refinement of a chunk, as `step_memory_bytes`; None without refinement."""
-        return _memory_bytes(self._refine)
+        return _memory_bytes(self._refine_program)
 
     def cache_facts(self) -> dict[str, int | float]:
         """Occupancy and counters of the cache; `decoded` is the number of Gaussians that are shown."""
