@@ -13,10 +13,10 @@ Nothing raises inside jit: losses are counted in `cache.stats`, and `check_cache
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
@@ -239,7 +239,7 @@ def required_capacity(caches: VoxelCache, config: StreamConfig, num_new_tokens: 
     """The capacity to which `ensure_capacity` enlarges a cache, or caches with leading axes, alike."""
     _require_values(caches, "ensure_capacity")
     new_rows = num_new_tokens if config.memory.vacc == "voxel" else -(-num_new_tokens // config.memory.pivots_per_voxel)
-    capacity, num_voxels = caches.capacity, int(np.asarray(caches.num_voxels).max())
+    capacity, num_voxels = caches.capacity, _over_all(jnp.max, caches.num_voxels)
     while config.memory.overflow == "grow" and capacity < num_voxels + new_rows:
         capacity *= 2
     return capacity
@@ -278,12 +278,17 @@ def check_cache(caches: VoxelCache, config: StreamConfig) -> None:
         InputError: it is called inside jit.
     """
     _require_values(caches, "check_cache")
-    num_dropped = int(np.asarray(caches.stats.num_dropped).sum())
+    num_dropped = _over_all(jnp.sum, caches.stats.num_dropped)
     if num_dropped and config.memory.overflow == "grow":
         raise CacheError(
             f"cache: wanted to keep every token, but {num_dropped} did not fit in {caches.capacity} voxels; "
             "call ss.ensure_capacity(cache, config, num_new_tokens) before each step."
         )
+
+
+def _over_all(reduce: Callable[[jax.Array], jax.Array], counters: Int[Array, "*b"]) -> int:
+    """The counters of one or several caches as one number; they may lie on devices of several processes."""
+    return int(reduce(counters) if counters.ndim else counters)  # a single one needs no program
 
 
 def _require_values(caches: VoxelCache, caller: str) -> None:

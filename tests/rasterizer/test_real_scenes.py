@@ -22,7 +22,7 @@ FORWARD = 1e-4  # outside the boundary band
 BAND = 1e-4  # relative distance of a sample to 1/255, or of a transmittance to the stop, that rounding may flip
 GRADIENT = 1e-3  # relative L2
 PIXELS, AT_ONCE = 256, 16
-EFFECTS = Effects()
+EFFECTS = Effects(antialias="classic")  # the renderer that the scene was made for
 
 
 def looking_at(gaussians: Gaussians) -> tuple[Gaussians, Camera]:

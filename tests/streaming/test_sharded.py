@@ -33,7 +33,7 @@ from tests.streaming.narrow_model import NARROW, assert_same_bits
 SUM_RTOL = 1e-6  # of the largest value: sums of about ten terms in another order; one float32 rounding is 6e-8
 STEP_RTOL = 1e-4  # of the largest value: rounding of the sums, which passes through the network with every chunk
 FLIPPED = 0.005  # share of voxels or pivots that such rounding may place or pair differently
-MODEL_CONFIG = NARROW.replace(capacity=4096, voxel_size=0.3)  # voxels so large that many tokens merge
+MODEL_CONFIG = NARROW.replace(capacity=4096, voxel_size=0.3, detail=False)  # voxels so large that many tokens merge
 PADDED_STEP = 2  # the step of the first stream that is padding
 TIMEOUT = 300  # seconds; a run usually takes some twenty
 
