@@ -44,8 +44,8 @@ def test_capacity_grows_by_doubling_and_never_shrinks():
 
 
 def test_stacked_caches_grow_alike_and_traced_ones_are_refused():
-    caches = [fuse(init_cache(GROW, 16), to_jax(tokens), GROW) for tokens in STREAM[:2]]
-    stacked = ensure_capacity(jax.tree.map(lambda *x: jnp.stack(x), *caches), GROW, NUM_TOKENS)
+    caches = [init_cache(GROW, 16), fuse(init_cache(GROW, 16), to_jax(STREAM[0]), GROW)]
+    stacked = ensure_capacity(jax.tree.map(lambda *x: jnp.stack(x), *caches), GROW, 17)
     assert stacked.capacity == 64
     for i, cache in enumerate(caches):
         jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x, i=i: x[i], stacked), grow(cache, 64))
