@@ -96,15 +96,13 @@ class StreamFrame:
         x, y, z = (np.round(self.origin, decimals) if is_coarse else np.zeros(3)).tolist()
         return x, y, z
 
-    def gaussians_to_capture(
-        self, gaussians: Gaussians, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ) -> Gaussians:
+    def gaussians_to_capture(self, gaussians: Gaussians) -> Gaussians:
         """Transforms Gaussians from the stream frame to the capture frame: means, quaternions, scales and SH bands.
 
-        Means are relative to `offset`, a point of the capture frame.
+        Means of the result are relative to its offset, `self.offset`.
 
         Limits:
-            The result is float32: means 1e5 capture units from `offset` have an error of up to 1e-2.
+            The result is float32: means 1e5 capture units from the offset have an error of up to 1e-2.
         """
         # On the host, where no program has to be compiled for each size of a scene.
         means, quats, scales, sh = (
@@ -113,10 +111,10 @@ class StreamFrame:
         w, x, y, z = Rotation.from_matrix(self.rotation).as_quat(scalar_first=True, canonical=True)
         product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])  # Hamilton's, from the left
         rows = {
-            "means": self.points_to_capture(means) - np.asarray(offset, np.float64),
+            "means": self.points_to_capture(means) - np.asarray(self.offset),
             "quats": quats @ product.T,
             "scales": scales / self.scale,
             "sh": np.einsum("kl,nlc->nkc", sh_rotation(self.rotation, gaussians.sh_degree), sh),
         }
         rows = jax.device_put({name: x.astype(np.float32) for name, x in rows.items()})
-        return replace(gaussians, **rows)
+        return replace(gaussians, **rows, offset=self.offset)

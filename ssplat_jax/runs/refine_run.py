@@ -15,7 +15,7 @@ from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, key_views_of
 from ssplat_jax.runs.open_run import load_run
 from ssplat_jax.runs.run_results import picture_views, report_run, save_scene, shown_frames
-from ssplat_jax.runs.stream_commands import Refine
+from ssplat_jax.runs.stream_commands import Refine, stopped
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder, lock_folder
 from ssplat_jax.storage.saved_states import check_same
@@ -25,20 +25,10 @@ KIND = "refinement state 1"
 MEASURED = ("max_pairs", "max_rows", "losses", "held_back", "seconds")  # fields of `Progress` that JSON holds
 
 
-@dataclasses.dataclass(frozen=True)
-class RefineResult:
-    """State of a refinement when `refine_run` returns."""
+def refine_run(params: dict, options: Refine, reporter: Reporter) -> int:
+    """Writes `refined.ply` beside the scene of a run, and says so; returns the exit code. `scene.ply` stays.
 
-    num_steps: int
-    before: dict  # scores of some streamed views, see `mean_scores`; empty if it was interrupted
-    after: dict
-    interrupted: int | None = None  # the signal that stopped it, if one did
-
-
-def refine_run(params: dict, options: Refine, reporter: Reporter) -> RefineResult:
-    """Writes `refined.ply` beside the scene of a run, continuing a refinement that stopped. `scene.ply` stays.
-
-    The pictures and the report of the run become those of the refined scene. An interrupted refinement writes the scene
+    A refinement that stopped is continued. The pictures and the report of the run become those of the refined scene. An interrupted refinement writes the scene
     so far.
 
     Args:
@@ -79,7 +69,7 @@ def refine_run(params: dict, options: Refine, reporter: Reporter) -> RefineResul
             refined = progress.scene(gaussians)
             save_scene(folder.refined_scene, refined, stream_frame, exposures)  # at the exposure of scene.ply
             if interrupts.received:  # read last: a signal may have come during the save, too
-                return RefineResult(progress.num_steps, {}, {}, interrupts.received)
+                return stopped(interrupts.received, f"after {progress.num_steps} steps", overwrites=options.overwrite)
         before = score_targets(gaussians, capture, tuple(shown_frames(indices)), stream_frame, exposures)
         scores = picture_views(folder, refined, capture, indices, stream_frame, exposures)
         after = mean_scores(scores)
@@ -89,7 +79,9 @@ def refine_run(params: dict, options: Refine, reporter: Reporter) -> RefineResul
         if folder.metrics.is_file():  # else there is no report to bring up to date
             metrics = json.loads(folder.metrics.read_text())
             report_run(folder, metrics, options.path, run.header["weights"], refined=scores)
-    return RefineResult(progress.num_steps, before, after)
+    shown = f"shown at {after['shown']['psnr']:.2f} dB instead of {before['shown']['psnr']:.2f}"
+    print(f"wrote {folder.refined_scene}: {progress.num_steps} steps, streamed views {shown}")
+    return 0
 
 
 def save_refinement(path: Path, progress: Progress, identity: dict[str, Any]) -> None:

@@ -59,11 +59,11 @@ def scene_to_show(gaussians: Gaussians, stream_frame: StreamFrame, exposures: Ex
 
     Args:
         gaussians: the scene, in the stream frame, at the exposure of the first views.
-        stream_frame: the similarity between both frames; positions of the result are relative to its offset.
+        stream_frame: the similarity between both frames; its offset becomes that of the result.
         exposures: exposures of the streamed frames.
     """
     scaled = _jitted_scale_colors(gaussians, middle_exposure(exposures).astype(np.float32))
-    return stream_frame.gaussians_to_capture(scaled, offset=stream_frame.offset)
+    return stream_frame.gaussians_to_capture(scaled)
 
 
 def save_scene(path: Path, gaussians: Gaussians, stream_frame: StreamFrame, exposures: Exposures) -> ExportReport:
@@ -72,7 +72,7 @@ def save_scene(path: Path, gaussians: Gaussians, stream_frame: StreamFrame, expo
     Raises:
         StorageError: the file cannot be written.
     """
-    return save_gaussians(path, scene_to_show(gaussians, stream_frame, exposures), offset=stream_frame.offset)
+    return save_gaussians(path, scene_to_show(gaussians, stream_frame, exposures))
 
 
 def finish_run(run: OpenRun, path: str, reporter: Reporter) -> int:

@@ -62,8 +62,7 @@ def decoded_scene(run_dir: Path, params: dict, reporter: Reporter) -> Gaussians:
     num_shown = int(session.cache_facts()["decoded"])
     # The rows after these are padding, of which a person need not be told.
     scene = scene_to_show(session.gaussians(), run.stream_frame, run.exposures)
-    scene = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[:num_shown]), scene)
-    return replace(scene, offset=run.stream_frame.offset)
+    return jax.tree.map(lambda x: jax.device_put(np.asarray(x)[:num_shown]), scene)
 
 
 @dataclasses.dataclass(frozen=True)

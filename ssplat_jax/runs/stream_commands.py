@@ -212,15 +212,7 @@ class Refine(OfCapture):
         from ssplat_jax.storage.weights import load_params
 
         require_count(steps=self.steps)
-        result = refine_run(load_params(self.weights), self, Reporter(self.quiet))
-        if result.interrupted:
-            return stopped(result.interrupted, f"after {result.num_steps} steps", overwrites=self.overwrite)
-        before, after = (scores["shown"]["psnr"] for scores in (result.before, result.after))
-        print(
-            f"wrote {self.folder}/refined.ply: {result.num_steps} steps, streamed views shown at {after:.2f} dB"
-            f" instead of {before:.2f}"
-        )
-        return 0
+        return refine_run(load_params(self.weights), self, Reporter(self.quiet))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -143,7 +143,7 @@ class GrowingScene:
         # At the middle exposure of the views so far.
         exposure = jnp.asarray(self._header["exposure"], jnp.float32)
         scene = scale_colors(jax.tree.map(jnp.asarray, self._sum), exposure)
-        return replace(frame.gaussians_to_capture(scene, offset=frame.offset), offset=frame.offset)
+        return frame.gaussians_to_capture(scene)
 
     def stream_frame(self) -> StreamFrame | None:
         """The frame of the stream; None before the first delta."""

@@ -45,13 +45,13 @@ def finished(tmp_path_factory, programs_shared):
     return out
 
 
-def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch):
+def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch, capsys):
     folder = RunFolder(finished)
     streamed = folder.scene.read_bytes()
-    result = refine(finished, overwrite=True)
-    whole, left_out = folder.refined_scene.read_bytes(), json.loads(folder.refinement.read_text())["num_left_out"]
-    assert result.num_steps == 4 and result.interrupted is None
-    assert result.after["shown"]["psnr"] > result.before["shown"]["psnr"]
+    assert refine(finished, overwrite=True) == 0
+    whole, report = folder.refined_scene.read_bytes(), json.loads(folder.refinement.read_text())
+    assert report["num_steps"] == 4
+    assert report["seen_views_after"]["shown"]["psnr"] > report["seen_views_before"]["shown"]["psnr"]
 
     folder.clear_refinement()
     steps, so_far = module.Progress.steps, [streamed]
@@ -63,17 +63,16 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
 
     monkeypatch.setattr(module.Progress, "steps", stopped_after_one)
     for taken in (1, 2):
-        result = refine(finished)
-        assert (result.num_steps, result.interrupted) == (taken, signal.SIGINT)
+        assert refine(finished) == 128 + signal.SIGINT and f"after {taken} steps" in capsys.readouterr().err
         so_far.append(folder.refined_scene.read_bytes())
     monkeypatch.undo()
     refine(finished)
     assert folder.refined_scene.read_bytes() == whole
     assert len({*so_far, whole}) == 4  # every stop wrote what its steps had reached
     assert folder.scene.read_bytes() == streamed != whole
-    report = json.loads(folder.refinement.read_text())
-    assert report["num_steps"] == len(report["losses"]) == 4
-    assert report["num_left_out"] == left_out
+    continued = json.loads(folder.refinement.read_text())
+    assert continued["num_steps"] == len(continued["losses"]) == 4
+    assert continued["num_left_out"] == report["num_left_out"]
     assert [load_scene(path).sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
 
 
@@ -81,9 +80,9 @@ def test_report_and_pictures_become_those_of_the_refined_scene(finished):
     folder = RunFolder(finished)
     stream(finished, overwrite=True)
     pictures = [path.read_bytes() for path in sorted(folder.views.iterdir())]
-    result = refine(finished)
-    page = folder.report.read_text()
-    for scores in (result.before, result.after):
+    refine(finished)
+    page, report = folder.report.read_text(), json.loads(folder.refinement.read_text())
+    for scores in (report["seen_views_before"], report["seen_views_after"]):
         assert f"{scores['shown']['psnr']:.2f} dB" in page
     refined = [path.read_bytes() for path in sorted(folder.views.iterdir())]
     assert len(refined) == len(pictures) and not set(refined) & set(pictures)
