@@ -59,14 +59,18 @@ class StreamingConfig(ConfigGroup):
 
 @dataclasses.dataclass(frozen=True)
 class HistoryConfig(ConfigGroup):
-    """Stages by which the cache informs the next chunk; both are off in `tiny`."""
+    """Stages by which the cache informs the next chunk."""
 
-    # In three pairs of trainings that differ in it alone, captures lose 0.02 to 0.06 dB by it and revisits gain 0.05.
-    hpda: bool = False
-    """Anchors depth distributions to cached geometry. Scenes with plain walls that the camera returns to gain by it."""
+    # Neighboring frames of video have little parallax: there the cache knows better. Where frames are dealt out until
+    # chunks have parallax, it errs as the matcher does, and scores fall.
+    hpda: bool | Literal["causal"] = "causal"
+    """Anchors depth distributions to cached geometry; `causal` does so where `stream.causal` is on."""
     # Trained for a short budget it moves no scene by more than 0.04 dB; longer training of all later stages lost.
     cgfi: bool = False
     """Injects cached features where the current views are uncertain."""
+
+    def rules(self) -> tuple[Rule, ...]:
+        return (("hpda", "true, false or 'causal'", self.hpda in (True, False, "causal")),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,8 +138,10 @@ class Additions(ConfigGroup):
     the expectation near the peak in that space, and the mass of neighboring candidates (ours)."""
     front_cluster: bool = True
     """The projection averages the front cluster of the pivots in a cell, instead of all of them."""
-    log_anchor: bool = True
-    """The anchor of HPDA has its width in log depth, instead of stream units."""
+    # One strength weighs a sure cell of the matcher like one without texture.
+    anchor: Literal["metric", "log", "learned"] = "learned"
+    """The anchor of HPDA. `metric`: one strength gamma, and a width in stream units (literal). `log`: the width is in
+    log depth. `learned`: a small network gives every cell the strength, width and place of its anchor (ours)."""
     # A zero feature alone does not tell a hole from a feature.
     residual_cgfi: bool = True
     """CGFI's U-Net also sees Omega and gives what is added to f, instead of the new features."""
@@ -157,7 +163,7 @@ class Additions(ConfigGroup):
     takes fewer, larger Gaussians."""
 
 
-LITERAL = Additions("metric", *(False,) * 7)
+LITERAL = Additions("metric", False, "metric", *(False,) * 5)
 """No additions: the paper as it is printed."""
 
 
@@ -255,6 +261,11 @@ class StreamConfig:
             if name == "network":
                 changes["network"] = value["kind"]
         return StreamConfig().replace(**changes)
+
+    @property
+    def is_anchored(self) -> bool:
+        """True if HPDA is on in this stream."""
+        return self.stream.causal if self.history.hpda == "causal" else bool(self.history.hpda)
 
     @property
     def hash(self) -> str:

@@ -129,6 +129,11 @@ class CompactConfig(_SharedShapes):
         )
 
     @property
+    def decoder_width(self) -> int:
+        """Channels of the matcher's decoder features."""
+        return self.unet_width
+
+    @property
     def size_multiple(self) -> int:
         """Images are padded to a multiple of this many pixels: cell size x attention window."""
         return 4 * self.attention_window
@@ -139,6 +144,8 @@ class ResplatConfig(_SharedShapes):
     """ReSplat's network (`network="resplat"`), with the same layers, so that its published weights can be imported."""
 
     kind: ClassVar[str] = "resplat"
+    decoder_width: ClassVar[int] = 128
+    """Channels of the matcher's decoder features."""
 
     num_depths: int = 128
     token_width: int = 256

@@ -58,7 +58,7 @@ def test_every_field_changes_the_hash(network):
         tuple: lambda x: (x[0] + 8, *x[1:]),
     }
     by_name = {"steps_per_chunk": 4, "scene_scale": 3.0, "sh_degree": 3, "depth_range": (0.5, 9.0), "mixer_radius": 7}
-    by_name |= {"mixer_blocks": 3}
+    by_name |= {"mixer_blocks": 3, "hpda": True}
     hashes, num_fields = {base.hash, base.replace(preset="other").hash}, 1
     for group in base.groups():
         for field in dataclasses.fields(getattr(base, group)):

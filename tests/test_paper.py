@@ -26,6 +26,7 @@ from ssplat_jax.model.views import DepthDistribution, Views, prepare_views
 from ssplat_jax.training import losses
 from ssplat_jax.training.recipe import RECIPES
 from tests.data.capture_fixture import smooth_capture
+from tests.model.small import history
 from tests.training.test_losses import sample_of
 
 PAPER = preset("paper")
@@ -138,7 +139,8 @@ def draw_tokens(rng, means) -> Tokens:
 def remember(cache, tokens: Tokens):
     """The cache after tokens of views that contradict every pivot: all see far behind them, with full confidence."""
     maps = jnp.full(GRID, 19.0), jnp.ones(GRID), jnp.zeros(GRID), jnp.ones((2, 3))
-    prediction = Prediction(tokens, jnp.zeros((*GRID, 1)), jnp.log(maps[0]), views(), ChunkOutput(*maps))
+    nothing = DepthDistribution(*jnp.zeros((3, *GRID, 1))), history(*jnp.zeros((2, *GRID)))
+    prediction = Prediction(tokens, *nothing, jnp.log(maps[0]), views(), ChunkOutput(*maps))
     return UPDATE(cache, prediction)
 
 

@@ -47,7 +47,7 @@ class ProjectedCache:
     confidences: Float[Array, "v hf wf"]  # Omega_H = sum w^2 / sum w
     feats: Float[Array, "v hf wf c"] | None  # F_H; None without `cgfi`, which alone reads it
     mask: Bool[Array, "v hf wf"]
-    colors: Float[Array, "v hf wf 3"] | None  # averaged like F_H; None without `match_exposure`
+    colors: Float[Array, "v hf wf 3"] | None  # averaged like F_H; None where nothing reads them, see `_has_colors`
 
 
 def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: str | None = None) -> ProjectedCache:
@@ -95,8 +95,13 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
         confidences=(squares / total).reshape(shape),
         feats=means[..., :width] if config.history.cgfi else None,
         mask=mask.reshape(shape),
-        colors=means[..., width:] if config.stream.match_exposure else None,
+        colors=means[..., width:] if _has_colors(config) else None,
     )
+
+
+def _has_colors(config: StreamConfig) -> bool:
+    """True if exposures are matched or the learned anchor compares colors."""
+    return config.stream.match_exposure or (config.is_anchored and config.additions.anchor == "learned")
 
 
 def coarsen(history: ProjectedCache, factor: int) -> ProjectedCache:
@@ -139,7 +144,7 @@ def _cluster_sums(fold, window, cache, num_views, config, fronts, centers):
         values = [jnp.zeros((len(pivots), 0))]
         if config.history.cgfi:
             values.append(flat(cache.feats)[pivots].astype(jnp.float32))
-        if config.stream.match_exposure:
+        if _has_colors(config):
             values.append(flat(cache.rgbs)[pivots].reshape(len(pivots), -1, 3).mean(axis=1))
         return jnp.concatenate(values, axis=1)
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ssplat_jax.core.console import Reporter
     from ssplat_jax.training.recipe import Recipe
 
-MINUTES = {"tiny": 77, "stream": 15, "evidence": 40}
+MINUTES = {"tiny": 77, "stream": 15, "anchor": 20, "evidence": 40}
 """Rough time of recipes on two free cores; docs/model_card.md has measured times, some of them beside other work."""
 
 
@@ -30,9 +30,9 @@ class Train:
     preset: str | None = None
     """Preset of the configuration. Default: the configuration of --init-weights; without that, tiny."""
     recipe: str = "tiny"
-    """tiny: trains depth from scratch. depth: continues that in batches of larger images, for a GPU. evidence: trains
-    the evidence head of --init-weights on whole streams. stream: trains the stages after depth. paper: the paper's
-    loss and steps, for imported weights or --preset paper, and a GPU."""
+    """tiny: trains depth from scratch. depth: continues that in batches of larger images, for a GPU. anchor: trains how
+    far --init-weights trust the cache (HPDA). evidence: trains their evidence head on whole streams. stream: trains
+    the stages after depth. paper: the paper's loss and steps, for imported weights or --preset paper, and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
     seed: int = 0
@@ -43,8 +43,8 @@ class Train:
     captures: tuple[Path, ...] = ()
     """Captures to learn from too, or folders of captures. Every 8th frame is held out."""
     shares: tuple[float, ...] = ()
-    """Share of the steps of each of --captures; the rest is procedural. Default: half of the steps, equally; all
-    of them in paper."""
+    """Share of the steps, in anchor of the streams, of each of --captures; the rest is procedural. Default: half,
+    equally; all in paper."""
     save_every: int = 200
     """Steps between checkpoints."""
     set: ConfigChanges = ()
@@ -116,9 +116,9 @@ class Train:
 
     def _refuse_unused(self, recipe: "Recipe") -> None:
         """Refuses options of which the recipe would make nothing."""
-        from ssplat_jax.training.samples import ViewSamples
+        from ssplat_jax.training.crops import Crops
 
-        if self.shares and not isinstance(recipe.phases[0].samples, ViewSamples):
+        if self.shares and isinstance(recipe.phases[0].samples, Crops):
             raise InputError(f"--shares: --recipe {self.recipe} has no use for it; leave it out.")
         if self.shares and not self.captures:
             raise InputError("--shares: wanted --captures beside it; got none.")

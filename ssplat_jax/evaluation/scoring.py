@@ -321,6 +321,7 @@ def evaluate(
         **timing,
         **cost,
         "config_hash": session.model.config.hash,
+        "hpda": session.model.config.is_anchored,
         "stream_frame": stream_frame.to_dict(),
         "baselines": reference,
         "exposures": exposures_to_json(exposures),

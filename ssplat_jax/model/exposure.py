@@ -44,7 +44,7 @@ def estimate_exposures(
         Cells with values that are not finite are not compared.
     """
     cached = history.colors
-    if cached is None:
+    if cached is None or not config.stream.match_exposure:
         return jnp.ones((len(views.viewmats), 3))
     seen = average_pool(views.images, GRID_STRIDE)
     cached_log_depths = safe_log(jnp.where(history.mask, history.depths, 1.0))

@@ -19,7 +19,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.decoder import EvidenceHead, num_features
-from ssplat_jax.model.hpda import AnchorStrength
+from ssplat_jax.model.hpda import AnchorMaps, AnchorStrength, num_inputs
 from ssplat_jax.model.resplat import ReSplatNetwork
 from ssplat_jax.model.views import GRID_STRIDE, AnchoredDepth, DepthDistribution, TokenShapes, Views
 from ssplat_jax.network_configs import NETWORK_CONFIGS
@@ -27,7 +27,7 @@ from ssplat_jax.network_configs import NETWORK_CONFIGS
 STAGES = (
     "encoder",
     "cost_volume",
-    "hpda",  # one scalar; without `history.hpda` it is there and not used
+    "hpda",  # there and not used where HPDA is off
     "upsampler",  # absent in networks that match on the feature grid, as the compact one
     "tokens",
     "cgfi",  # absent without `history.cgfi`
@@ -54,6 +54,8 @@ class NetworkConfig(Protocol):
     """Space in which candidates are uniform: `log` or `inverse`."""
     num_depths: int
     """Number of depth candidates."""
+    decoder_width: int
+    """Channels of `DepthDistribution.decoder`."""
     token_width: int
     """Channels of a token's feature, as stored in the cache."""
     cgfi_width: int
@@ -199,7 +201,9 @@ def _modules(config: StreamConfig, network: Network) -> dict:
     v, side, c = 2, config.network.size_multiple // GRID_STRIDE, config.network.token_width
     grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
     shared: dict = {
-        "hpda": (AnchorStrength(), ()),
+        "hpda": (AnchorMaps(), (grid(num_inputs(config)),))
+        if config.additions.anchor == "learned"
+        else (AnchorStrength(), ()),
         "cgfi": (Aggregator(config), (grid(c), grid(num_hints(config)), jnp.ones(v, bool))),
     }
     if config.head.evidence:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.changes import changed_gaussians, unpack
 from ssplat_jax.cache.fuse import fuse
-from ssplat_jax.cache.project import coarsen, project, rows_in_sight
+from ssplat_jax.cache.project import ProjectedCache, coarsen, project, rows_in_sight
 from ssplat_jax.cache.state import Tokens, VoxelCache, init_cache
 from ssplat_jax.cache.votes import carve, observe, seen_cells, store_depths, vote
 from ssplat_jax.config import StreamConfig
@@ -34,7 +34,7 @@ from ssplat_jax.model.decoder import MAX_SCALE, Evidence, apply_evidence, decode
 from ssplat_jax.model.exposure import estimate_exposures
 from ssplat_jax.model.hpda import anchor_depth
 from ssplat_jax.model.network import init_params, network_of
-from ssplat_jax.model.views import GRID_STRIDE, Views, back_project, patch_colors, prepare_views, repeat_cells
+from ssplat_jax.model.views import GRID_STRIDE, DepthDistribution, Views, back_project, patch_colors, prepare_views
 
 
 @pytree
@@ -52,7 +52,8 @@ class Prediction:
     """All results of the network for one chunk. Training losses use all of them; `step` returns only `output`."""
 
     tokens: Tokens
-    logits: Float[Array, "v hf wf d"]  # logits of P_i
+    distribution: DepthDistribution  # P_i, on the matching grid
+    history: ProjectedCache  # the cache before the chunk, on the matching grid
     log_depths: Float[Array, "v hf wf"]  # expectation under P^v
     views: Views
     output: ChunkOutput
@@ -97,7 +98,8 @@ class StreamSplat:
         with jax.named_scope("match"):
             distribution = network.match(params["cost_volume"], features, views, config)
         with jax.named_scope("HPDA"):
-            depth = anchor_depth(params["hpda"], distribution, coarsen(history, factor), views, config)
+            coarse = coarsen(history, factor)
+            depth = anchor_depth(params["hpda"], distribution, coarse, views, config)
         with jax.named_scope("refine"):
             depth = network.refine_depth(params.get("upsampler"), features, depth, views, config)
         with jax.named_scope("tokens"):
@@ -113,9 +115,8 @@ class StreamSplat:
         with jax.named_scope("exposure"):
             exposures = estimate_exposures(history, depth.log_depths, confidences, views, config)
         tokens = _flatten_tokens(positions, feats, confidences, footprints, exposures, views, config)
-        logits = repeat_cells(distribution.logits, factor)
         output = ChunkOutput(jnp.exp(depth.log_depths), confidences, history.confidences, exposures)
-        return Prediction(tokens, logits, depth.log_depths, views, output)
+        return Prediction(tokens, distribution, coarse, depth.log_depths, views, output)
 
     def step(self, params: dict, cache: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """The cache after one chunk, and a summary of the chunk. Pure; the cache comes first, as the carry of a scan.

@@ -28,8 +28,8 @@ MEASURED = ("max_pairs", "max_rows", "losses", "held_back", "seconds")  # fields
 def refine_run(params: dict, options: Refine, reporter: Reporter) -> int:
     """Writes `refined.ply` beside the scene of a run, and says so; returns the exit code. `scene.ply` stays.
 
-    A refinement that stopped is continued. The pictures and the report of the run become those of the refined scene. An interrupted refinement writes the scene
-    so far.
+    A refinement that stopped is continued; an interrupted one writes the scene so far. The pictures and the report of
+    the run become those of the refined scene.
 
     Args:
         params: parameters of the run's model.

@@ -107,6 +107,7 @@ def finish_run(run: OpenRun, path: str, reporter: Reporter) -> int:
         "cache": run.session.cache_facts(),
         "stream_frame": stream_frame.to_dict(),
         "config_hash": run.session.model.config.hash,
+        "hpda": run.session.model.config.is_anchored,
     }
     report_run(folder, metrics, path, run.weights)
     write_json(folder.metrics, metrics)

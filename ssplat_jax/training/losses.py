@@ -23,9 +23,12 @@ from ssplat_jax.cache.votes import vote
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color
 from ssplat_jax.evaluation.metrics import LpipsWeights
 from ssplat_jax.evaluation.metrics import lpips as lpips_distance
+from ssplat_jax.model.hpda import MIN_PROB, expected_log_depth, inject_anchor, learned_anchor
 from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.model.views import GRID_STRIDE, repeat_cells
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.compared_views import EFFECTS
+from ssplat_jax.training.anchors import AnchorSample
 from ssplat_jax.training.crops import CropSample
 from ssplat_jax.training.samples import Sample
 
@@ -70,7 +73,7 @@ class DepthLoss:
             prediction = model.predict(params, cache, chunk)
             cache, shape = model.update_cache(cache, prediction), prediction.log_depths.shape
             losses = depth_loss(
-                prediction.logits,
+                repeat_cells(prediction.distribution.logits, config.network.match_stride // GRID_STRIDE),
                 prediction.log_depths,
                 # Padded as images are; the loss skips the padding by `inside`.
                 jnp.pad(truth, [(0, n - m) for m, n in zip(truth.shape, shape, strict=True)], mode="edge"),
@@ -87,6 +90,38 @@ class DepthLoss:
         loss = entropy + self.l1_weight * l1
         accepted = jnp.mean((tokens.confidences >= config.memory.min_confidence).astype(jnp.float32))
         return cache, tokens, loss, {"depth_entropy": entropy, "depth_l1": l1, "accepted": accepted, "loss": loss}
+
+
+@dataclasses.dataclass(frozen=True)
+class AnchorLoss:
+    """Loss of the depths that the learned anchor leads to, in cells that the cache has: cross entropy + L1."""
+
+    l1_weight: float = 2.0  # weight of the L1 of log depth beside the cross entropy of the anchored distribution
+    target_width: float = 0.6  # see `DepthLoss`
+    renders: ClassVar[bool] = False
+
+    def __call__(
+        self, model: StreamSplat, params: dict, batch: AnchorSample, lpips: Lpips = None
+    ) -> tuple[Scalar, Metrics]:
+        """Mean loss of the samples along the leading axis of `batch`, and beside it the L1 without the anchor."""
+
+        def of_sample(sample: AnchorSample) -> tuple[Scalar, Metrics]:
+            inputs, candidates = sample.inputs, sample.log_candidates
+            probs = inject_anchor(inputs.probs, learned_anchor(params["hpda"], inputs), 1.0)
+
+            def loss(probs):
+                predicted = expected_log_depth(probs, candidates, model.config)
+                logits = jnp.log(jnp.maximum(probs, MIN_PROB))
+                usable = sample.usable & inputs.mask
+                return depth_loss(
+                    logits, predicted, sample.log_depths, candidates, usable, target_width=self.target_width
+                )
+
+            entropy, l1 = loss(probs)
+            total = entropy + self.l1_weight * l1
+            return total, {"entropy": entropy, "l1": l1, "l1_of_matcher": loss(inputs.probs)[1], "loss": total}
+
+        return _mean_over(of_sample, batch, along=jax.vmap)
 
 
 @dataclasses.dataclass(frozen=True)

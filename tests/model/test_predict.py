@@ -69,7 +69,7 @@ def check_prediction(given, cache, weights):
     """Checks values, gradients, distributions and ranges of a chunk, and the cache after it."""
     (value, (prediction, after)), gradient = small.program()(weights, cache, given)
     assert small.finite((value, gradient, prediction, after))
-    probs = np.asarray(jax.nn.softmax(prediction.logits), np.float64)
+    probs = np.asarray(prediction.distribution.probs, np.float64)
     assert (probs >= 0).all()
     np.testing.assert_allclose(probs.sum(-1), 1, rtol=0, atol=SUMS)
     span = np.log([given.near, given.far])

@@ -59,7 +59,7 @@ def test_resplat_computes_what_the_authors_code_computes():
         gaussians = model.decode_tokens(params, prediction.tokens)
         axes = quats_to_matrices(gaussians.quats)
         return {
-            "tap.depth_predictor.depth_head.0": prediction.logits[:, ::2, ::2].transpose(0, 3, 1, 2),
+            "tap.depth_predictor.depth_head.0": prediction.distribution.logits.transpose(0, 3, 1, 2),
             "tap.gaussian_head.in0": prediction.tokens.feats,
             "out.opacities": gaussians.opacities,
             "out.scales": gaussians.scales,

@@ -12,7 +12,14 @@ import pytest
 
 from ssplat_jax.core.numerics import softplus_inverse
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.hpda import anchor_depth, expected_log_depth, peak_confidence
+from ssplat_jax.model.hpda import (
+    AnchorMaps,
+    anchor_depth,
+    anchor_inputs,
+    expected_log_depth,
+    num_inputs,
+    peak_confidence,
+)
 from ssplat_jax.model.views import DepthDistribution, prepare_views
 from tests.model.small import CONFIG, chunk, finite, history
 
@@ -102,7 +109,7 @@ anchor_case(
     confidences=1.0,
     raw_gamma=1e6,
 )
-anchor_case("sigma in scene units", log_anchor=False, confidences=1.0, at=5, raw_gamma=1e6)
+anchor_case("sigma in scene units", anchor="metric", confidences=1.0, at=5, raw_gamma=1e6)
 
 
 def wave(tree):
@@ -124,7 +131,7 @@ def anchoring(config):
     return jax.jit(jax.value_and_grad(run, argnums=(0, 1, 2), has_aux=True))
 
 
-def anchor_inputs(changes: dict, config) -> dict:
+def anchor_inputs_of(changes: dict, config) -> dict:
     rng = np.random.default_rng(0)
     given = {
         "logits": jnp.asarray(2 * rng.normal(size=(*SHAPE, D)), jnp.float32),
@@ -137,14 +144,14 @@ def anchor_inputs(changes: dict, config) -> dict:
         given["depths"] = np.exp(np.interp(given.pop("at"), np.arange(D), given["log_candidates"]))
     for name in ("depths", "confidences"):
         given[name] = np.broadcast_to(given[name], SHAPE)
-    return given | {"config": config.replace(log_anchor=given.pop("log_anchor", True))}
+    return given | {"config": config.replace(anchor=given.pop("anchor", "log"))}
 
 
 @pytest.mark.parametrize("readout", READOUTS)
 @pytest.mark.parametrize("name", ANCHORS)
 def test_hard_anchor(name, readout):
     changes, limit = ANCHORS[name]
-    given = anchor_inputs(changes, READOUTS[readout])
+    given = anchor_inputs_of(changes, READOUTS[readout])
     past = history(given["depths"], given["confidences"])
     inputs = (given["logits"], jnp.float32(given["raw_gamma"]), given["log_candidates"])
     (value, (matched, result)), gradients = anchoring(given["config"])(*inputs, past)
@@ -164,7 +171,7 @@ def test_hard_anchor(name, readout):
 
 def test_gradient_of_gamma_equals_finite_differences():
     """Also where gamma is small, so that training can strengthen a weak anchor again."""
-    given = anchor_inputs({}, MEAN)
+    given = anchor_inputs_of({}, MEAN)
     past = history(given["depths"], given["confidences"])
     program = anchoring(MEAN)
     value = lambda raw: float(program(given["logits"], jnp.float32(raw), CANDIDATES, past)[0][0])  # noqa: E731
@@ -173,6 +180,130 @@ def test_gradient_of_gamma_equals_finite_differences():
         (_, _), gradients = program(given["logits"], jnp.float32(raw), CANDIDATES, past)
         assert slope != 0
         assert float(gradients[1]) == pytest.approx(slope, rel=2e-2, abs=1e-5)
+
+
+# -- The learned anchor ------------------------------------------------------------------------------------------------
+
+LEARNED = WINDOW.replace(anchor="learned")
+IMAGE = jnp.asarray(np.random.default_rng(7).uniform(size=(1, 8, 16, 3)), jnp.float32)
+COLORS = np.random.default_rng(8).uniform(size=(*SHAPE, 3))
+STARTS = (0.1, 1.0, 0.0)  # strength, width and shift of an untrained anchor
+
+
+@functools.cache
+def learned():
+    """Program of value, gradients and results for one set of raw maps, constant over the cells."""
+    views = jax.jit(prepare_views, static_argnums=1)(chunk(), CONFIG)
+    first = {name: getattr(views, name)[:1] for name in ("viewmats", "Ks", "valid", "unusable")}
+    views = replace(views, **first, images=IMAGE, inside=views.inside[:1, :2, :4])
+    untrained = AnchorMaps().init(jax.random.key(1), jnp.zeros((*SHAPE, num_inputs(LEARNED))))["params"]
+
+    def run(logits, raw, log_candidates, past):
+        distribution = DepthDistribution(
+            jax.nn.softmax(logits), logits, jnp.zeros((*SHAPE, LEARNED.network.unet_width))
+        )
+        params = untrained | {"out": untrained["out"] | {"bias": raw}}
+        here = replace(views, log_candidates=log_candidates)
+        result = anchor_depth(params, distribution, past, here, LEARNED)
+        return wave(result), (distribution.probs, result, anchor_inputs(distribution, past, here, LEARNED))
+
+    return jax.jit(jax.value_and_grad(run, argnums=(0, 1, 2), has_aux=True))
+
+
+def run_learned(raw=(0.0, 0.0, 0.0), **changes):
+    given = anchor_inputs_of(changes, LEARNED)
+    colors = np.where(given["depths"][..., None] > 0, COLORS, 0.0)
+    past = history(given["depths"], given["confidences"], colors=colors)
+    return given, learned()(given["logits"], jnp.asarray(raw, jnp.float32), given["log_candidates"], past)
+
+
+@pytest.mark.parametrize(
+    ("raw", "meant"),
+    [
+        ((0.0, 0.0, 0.0), STARTS),
+        ((-200.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ((1e6, 0.0, 0.5), (1e6, 1.0, 2 * np.tanh(0.5))),
+        (
+            (2.0, 1e6, -1e6),
+            (np.log1p(np.exp(2.0) * np.expm1(0.1)), np.exp(2.0), -2.0),
+        ),  # width and shift at their bounds
+        ((2.0, -1e6, 1e6), (np.log1p(np.exp(2.0) * np.expm1(0.1)), np.exp(-1.0), 2.0)),
+    ],
+)
+def test_the_learned_anchor_is_a_gaussian_about_the_cached_depth(raw, meant):
+    """In float64: strength, width in steps, and shift in steps as the raw maps say, within their bounds."""
+    given, ((value, (matched, result, _)), gradients) = run_learned(raw)
+    strength, width, shift = meant
+    places = np.interp(np.log(given["depths"]), np.asarray(CANDIDATES, np.float64), np.arange(D))
+    anchor = strength * np.exp(-0.5 * ((np.arange(D) - places[..., None] - shift) / width) ** 2)
+    wanted = (np.asarray(matched, np.float64) + anchor) / (1 + anchor.sum(-1, keepdims=True))
+    np.testing.assert_allclose(result.probs, wanted, atol=FLOAT32)
+    assert finite((value, result, gradients))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"depths": 0.0, "confidences": 0.0},
+        {"depths": 1e-30},
+        {"depths": 1e30},
+        {"logits": 1e30 * jnp.eye(D)[3] * jnp.ones((*SHAPE, 1))},
+        {"log_candidates": jnp.full(D, 0.7), "at": 2},
+        {"logits": jnp.full((*SHAPE, 1), 3.0), "log_candidates": jnp.full(1, 0.7), "depths": 5.0},
+    ],
+    ids=[
+        "all holes",
+        "before the near end",
+        "beyond the far end",
+        "logits of 1e30",
+        "near equals far",
+        "one candidate",
+    ],
+)
+def test_hard_learned_anchor(changes):
+    _, ((value, (matched, result, inputs)), gradients) = run_learned((1e6, 0.0, 0.0), **changes)
+    assert finite((value, result, inputs, gradients))
+    np.testing.assert_allclose(np.asarray(result.probs, np.float64).sum(-1), 1.0, rtol=0, atol=PROBABILITY_SUM_ATOL)
+    if np.shape(changes.get("depths")) == () and changes.get("depths") in (0.0, 1e-30, 1e30):
+        np.testing.assert_array_equal(result.probs, matched)
+    if changes.get("depths") == 0.0:  # holes say nothing
+        assert not np.asarray(inputs.features)[..., -(2 * 6 + 1 + 8) :].any()
+
+
+def test_the_learned_anchor_reads_matcher_and_cache_about_their_depths():
+    """The features in float64, cell by cell; colors are compared after their mean difference is taken out."""
+    given, ((_, (matched, _, inputs)), _) = run_learned()
+    probs, candidates = np.asarray(matched, np.float64), np.asarray(CANDIDATES, np.float64)
+    logs = np.log(np.maximum(probs, 1e-5)) / 4 + 1
+    colors = np.asarray(IMAGE, np.float64).reshape(1, 2, 4, 4, 4, 3).mean(axis=(2, 4))
+    apart = colors - COLORS
+    apart -= apart.mean(axis=(1, 2))
+    unanchored = expected_log_depth(matched, CANDIDATES, LEARNED)
+    for v, i, j in np.ndindex(SHAPE):
+        around = []
+        for log_depth in (float(unanchored[v, i, j]), np.log(given["depths"][v, i, j])):
+            place = np.interp(log_depth, candidates, np.arange(D))
+            around.append((place, np.interp(place + np.arange(-6, 7), np.arange(D), logs[v, i, j])))
+        (own, of_own), (cached, of_cached) = around
+        sure = max(probs[v, i, j, max(0, k - 1) : k + 2].sum() for k in range(D))
+        of_matcher = [*of_own, *np.zeros(LEARNED.network.unet_width), *(4 * (colors[v, i, j] - 0.5)), sure, own / D]
+        offsets = [np.tanh((own - cached) / 2), np.tanh((own - cached) / 8)]
+        of_cache = [*of_cached, *offsets, given["confidences"][v, i, j], 1.0, *(8 * apart[v, i, j]), cached / D]
+        np.testing.assert_allclose(inputs.features[v, i, j], [*of_matcher, *of_cache], atol=1e-4)
+
+
+@pytest.mark.parametrize("readout", READOUTS)
+def test_hpda_is_on_in_causal_streams_alone_unless_a_field_says_so(readout):
+    given = anchor_inputs_of({}, READOUTS[readout])
+    past = history(given["depths"], given["confidences"])
+    inputs = (given["logits"], jnp.float32(given["raw_gamma"]), CANDIDATES, past)
+    on, off, asked, causal = (
+        anchoring(given["config"].replace(hpda=hpda, causal=is_causal))(*inputs)[0][1][1].probs
+        for hpda, is_causal in ((True, False), (False, True), ("causal", False), ("causal", True))
+    )
+    np.testing.assert_array_equal(asked, off)
+    np.testing.assert_array_equal(causal, on)
+    assert not np.array_equal(on, off)
 
 
 @pytest.mark.parametrize(("readout", "half_width"), [("metric", 0), ("mean", 0), ("window", 1)])

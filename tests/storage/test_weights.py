@@ -67,10 +67,10 @@ def test_training_changes_a_stage_and_decay_does_not():
     assert changed_shares(later, WeightsFacts(NARROW, provenance, 0))["encoder"] > 0.5
 
 
-def test_matcher_and_evidence_head_of_the_shipped_weights_are_trained_and_other_stages_are_not():
+def test_matcher_anchor_and_evidence_head_of_the_shipped_weights_are_trained_and_other_stages_are_not():
     facts = describe_weights("tiny")
     assert facts.config == preset("tiny") and facts.num_bytes < 8e6
     shares = changed_shares(load_params("tiny"), facts)
-    trained = ("encoder", "cost_volume", "evidence")
+    trained = ("encoder", "cost_volume", "hpda", "evidence")
     assert min(shares[name] for name in trained) > 0.3
     assert max(shares[name] for name in shares if name not in trained) < 0.01

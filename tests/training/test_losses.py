@@ -6,6 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from ssplat_jax.cache.state import init_cache
@@ -13,10 +14,12 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.metrics import LpipsWeights
+from ssplat_jax.model.hpda import AnchorInputs, AnchorMaps, num_inputs
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.training import loop, losses
+from ssplat_jax.training.anchors import AnchorSample
 from ssplat_jax.training.crops import CropSample, crop_camera
 from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import Sample
@@ -149,6 +152,47 @@ def test_masked_pixels_of_a_target_have_neither_value_nor_gradient():
     other = of(gaussians, jnp.where(seen[..., None], targets, 1 - targets), seen)
     assert value == other[0] > 0 and jax.tree.all(jax.tree.map(np.array_equal, gradient, other[1]))
     assert of(gaussians, targets, seen & False)[0] == 0.0
+
+
+def test_the_anchor_learns_where_the_cache_is_right():
+    """From a feature that says so; the matcher is wrong in half of the cells, the cache in the other half."""
+    rng, num = np.random.default_rng(5), 16
+    truth = rng.uniform(2, num - 3, (2, 1, 8, 8))
+    is_cache_right = rng.uniform(size=truth.shape) < 0.5
+    wrong = rng.uniform(2, num - 3, truth.shape)
+    matched, cached = np.where(is_cache_right, wrong, truth), np.where(is_cache_right, truth, wrong)
+    probs = np.exp(-0.5 * (np.arange(num) - matched[..., None]) ** 2)
+    features = np.where(is_cache_right, 1.0, -1.0)[..., None] * np.ones(num_inputs(NARROW))
+    candidates = 0.1 * np.arange(num)
+    floats = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    batch = AnchorSample(
+        inputs=AnchorInputs(
+            floats(features),
+            floats(probs / probs.sum(-1, keepdims=True)),
+            floats(cached),
+            jnp.ones(truth.shape, bool).at[:, :, 0].set(False),
+        ),
+        log_candidates=floats(np.stack([candidates] * 2)),
+        log_depths=floats(0.1 * truth).at[:, :, :, 0].set(jnp.nan),
+        usable=jnp.ones(truth.shape, bool),
+    )
+    params = {"hpda": AnchorMaps().init(jax.random.key(0), batch.inputs.features[0])["params"]}
+    model, optimizer = StreamSplat(NARROW), optax.adam(0.01)
+
+    @jax.jit
+    def step(params, state):
+        (_, metrics), gradients = jax.value_and_grad(losses.AnchorLoss(), argnums=1, has_aux=True)(model, params, batch)
+        updates, state = optimizer.update(gradients, state)
+        return optax.apply_updates(params, updates), state, metrics
+
+    state = optimizer.init(params)
+    for _ in range(150):
+        params, state, metrics = step(params, state)
+    assert float(metrics["l1"]) < 0.25 * float(metrics["l1_of_matcher"])
+    # Holes of the cache and unknown depths do not count.
+    known = np.s_[:, :, 1:, 1:]
+    wanted = np.abs(0.1 * (matched - truth))[known].mean()
+    assert float(metrics["l1_of_matcher"]) == pytest.approx(wanted, rel=0.1)
 
 
 def test_fitted_gains_undo_exposures_and_stay_bounded():

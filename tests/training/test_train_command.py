@@ -1,6 +1,7 @@
 """`ssplat train`: what it starts from, what it refuses and what it writes, and the evidence head on whole streams."""
 
 import dataclasses
+import json
 from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,21 +13,25 @@ import pytest
 
 from ssplat_jax.commands.weights_commands import Train
 from ssplat_jax.config import preset
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.storage.weights import describe_weights, load_params, load_weights, save_weights
-from ssplat_jax.training import crops, loop, recipe
+from ssplat_jax.training import anchors, crops, loop, recipe
+from ssplat_jax.training.anchors import StreamParts
 from ssplat_jax.training.crops import Crops
-from ssplat_jax.training.recipe import EVIDENCE_RECIPE
+from ssplat_jax.training.recipe import ANCHOR_RECIPE, EVIDENCE_RECIPE
+from ssplat_jax.training.samples import TrainingStart, ViewSamples
 from tests.model.small import draw_with_numpy, random_params
 from tests.streaming.narrow_model import FEW_GAUSSIANS, assert_same_bits
 from tests.training.problems import flat
 
 SMALL = FEW_GAUSSIANS.replace(hpda=False, cgfi=False)
 SHIPPED = Path(str(resources.files("ssplat_jax") / "weights" / "tiny.npz"))
+PARTS = StreamParts(ViewSamples(2, ((64, 64),)), num_streams=2, size=(8, 12), capacity=1 << 12)
 CROPS = Crops(procedural=("procedural:room?frames=12",), width=64, size=(32, 48))
 
 
@@ -95,6 +100,63 @@ def test_half_of_the_views_of_a_crop_were_never_streamed(trained):
     shown = [i for i in range(12) if any(np.abs(capture.image(i) - x).max() < 0.01 for x in images)]
     assert set(split.targets) < set(shown) and len(shown) == len(images) == 2 * len(split.targets)
     assert np.isfinite(views.exposures).all() and (views.exposures > 0).all()
+
+
+@pytest.fixture(scope="module")
+def anchored(tmp_path_factory):
+    """Folder of a command that trained the learned anchor on two short streams."""
+    out, (phase,) = tmp_path_factory.mktemp("anchor"), ANCHOR_RECIPE.phases
+    with pytest.MonkeyPatch.context() as patch:
+        draw_with_numpy(patch, compiled=("hpda",))
+        phase = dataclasses.replace(phase, steps=6, samples=PARTS, warmup_steps=1)
+        patch.setitem(recipe.RECIPES, "anchor", dataclasses.replace(ANCHOR_RECIPE, phases=(phase,)))
+        save_weights(out / "narrow.npz", random_params(SMALL), SMALL, {})
+        assert Train(out=out, recipe="anchor", init_weights=out / "narrow.npz", quiet=True).run() == 0
+    return out
+
+
+def test_the_anchor_learns_alone(anchored):
+    (before, _), (after, config) = (load_weights(anchored / name) for name in ("narrow.npz", "weights.npz"))
+    assert config == SMALL
+    for stage in before:
+        same = [np.array_equal(a, b) for a, b in zip(flat(before[stage]), flat(after[stage]), strict=True)]
+        assert all(same) == (stage != "hpda")
+    assert np.abs(after["hpda"]["out"]["kernel"]).max() > 0  # zeros before training
+    (record,) = (json.loads(line) for line in (anchored / "log.jsonl").read_text().splitlines())
+    assert np.isfinite(list(record[name] for name in ("l1", "l1_of_matcher", "entropy"))).all()
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4, 5, 6, 7], [0, 2, 4, 6, 1, 3, 5, 7]], ids=["in order", "dealt out"])
+def test_parts_of_a_stream_are_cells_of_its_later_chunks(order, monkeypatch):
+    """Those that a model finds which takes the same chunks one after the other."""
+    monkeypatch.setattr(anchors, "DEALT_OUT", float(order[1] == 2))
+    model, params, said = StreamSplat(SMALL), random_params(SMALL), []
+    start = TrainingStart(model, params, None, 3, 4, said.append)
+    sample = jax.tree.map(lambda x: x[0], PARTS.views.open(start)(0, 0))
+    causal = StreamSplat(SMALL.replace(causal=True, capacity=PARTS.capacity, overflow="drop_new"))
+    ordered = lambda x: x.reshape(8, *x.shape[2:])[np.array(order)].reshape(x.shape)  # noqa: E731
+    given, truths = sample.chunks, ordered(sample.log_depths)
+    given = replace(given, **{name: ordered(getattr(given, name)) for name in ("images", "viewmats", "Ks")})
+    chunks = [jax.tree.map(lambda x, t=t: x[t], given) for t in range(2)]
+    cache, _ = jax.jit(causal.step)(params, causal.init_cache(), chunks[0])
+    prediction = jax.jit(causal.predict)(params, cache, chunks[1])
+    part_of = dataclasses.replace(PARTS, num_streams=1).open(start)
+    for step in range(3):
+        part = jax.tree.map(lambda x: x[0], part_of(step, step))
+        assert part.inputs.mask.any() and part.usable.all()
+        places = [  # where the part lies in the second chunk
+            (y, x)
+            for y in range(16 - 8 + 1)
+            for x in range(16 - 12 + 1)
+            if np.array_equal(part.inputs.mask, prediction.history.mask[:, y : y + 8, x : x + 12])
+        ]
+        probs, truth = np.asarray(prediction.distribution.probs), np.asarray(truths[1])
+        assert any(
+            np.allclose(part.inputs.probs, probs[:, y : y + 8, x : x + 12], atol=1e-3)
+            and np.array_equal(part.log_depths[:, :7, :11], truth[:, y : y + 7, x : x + 11])
+            for y, x in places
+        )
+    assert said == ["streamed 1 of 1"]
 
 
 @pytest.fixture
