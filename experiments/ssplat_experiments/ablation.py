@@ -35,7 +35,7 @@ from ssplat_jax.streaming.session import Session, feed_capture
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.loop import train
 from ssplat_jax.training.losses import RenderingLoss
-from ssplat_jax.training.recipe import AFTER_MATCHER, EVIDENCE_RECIPE, MATCHER, Phase, Recipe, learning
+from ssplat_jax.training.recipe import AFTER_MATCHER, EVIDENCE_RECIPE, MATCHER, Phase, Recipe
 from ssplat_jax.training.samples import CaptureMix, ViewSamples, open_mix
 
 REVISIT = "revisit"  # name of the procedural scene that is scored
@@ -92,7 +92,7 @@ class Budget:
             self.steps,
             ViewSamples(self.num_chunks, (self.size,), num_targets=2),
             RenderingLoss(max_pairs=self.max_pairs),
-            learning(*(stage for stage in AFTER_MATCHER if stage not in untrained)),
+            tuple(stage for stage in AFTER_MATCHER if stage not in untrained),
             learning_rate=3e-4,
             warmup_steps=10,
         )

@@ -58,28 +58,21 @@ class TrainResult:
 def optimizer(recipe: Recipe, params: dict) -> optax.GradientTransformationExtraArgs:
     """Clipping by the global norm, and AdamW at the rates of the phases. To try another optimizer, change it here.
 
-    It serves all phases: where a part is a constant its rate is 0, which moves nothing.
+    It serves all phases: where a stage is a constant its rate is 0, which moves nothing.
     """
-    factors = {}  # of the learning rate in each phase, by their text: the labels of a tree cannot be tuples
-
-    def label(path, _) -> str:
-        found = tuple(phase.rate("/".join(key.key for key in path)) for phase in recipe.phases)
-        factors[str(found)] = found
-        return str(found)
-
-    labels = jax.tree_util.tree_map_with_path(label, params)
-    rates = {name: optax.scale_by_schedule(schedule(recipe, found)) for name, found in factors.items()}
+    learns = {stage: tuple(stage in phase.stages for phase in recipe.phases) for stage in params}
+    rates = {stage: optax.scale_by_schedule(schedule(recipe, found)) for stage, found in learns.items()}
     adamw = optax.adamw(1.0, b2=recipe.adam_b2, weight_decay=recipe.weight_decay)
     clip = optax.identity() if recipe.clip_norm is None else optax.clip_by_global_norm(recipe.clip_norm)
     direction = optax.apply_if_finite(optax.chain(clip, adamw), ALWAYS)
-    return optax.chain(direction, optax.multi_transform(rates, labels))
+    return optax.chain(direction, optax.multi_transform(rates, {stage: stage for stage in params}))
 
 
-def schedule(recipe: Recipe, factors: tuple[float, ...]) -> optax.Schedule:
-    """Learning rate by step of a part with a factor in each phase: every phase warms up, and decays by a cosine."""
+def schedule(recipe: Recipe, learns: tuple[bool, ...]) -> optax.Schedule:
+    """Learning rate by step of a stage that learns in some phases: each warms up, and decays by a cosine."""
     pieces = []
-    for phase, factor in zip(recipe.phases, factors, strict=True):
-        warmup, peak = min(phase.warmup_steps, phase.steps) - 1, factor * phase.learning_rate
+    for phase, does_learn in zip(recipe.phases, learns, strict=True):
+        warmup, peak = min(phase.warmup_steps, phase.steps) - 1, does_learn * phase.learning_rate
         first, last = peak / (warmup + 1), peak * phase.final_share
         pieces.append(optax.warmup_cosine_decay_schedule(first, peak, warmup, phase.steps, last))
     return optax.join_schedules(pieces, np.cumsum([phase.steps for phase in recipe.phases])[:-1].tolist())

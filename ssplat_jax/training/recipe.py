@@ -2,7 +2,7 @@
 
 A recipe is a sequence of phases, and a phase is samples, a loss, the parts that learn by it, and a number of steps:
 
-    Phase("depth", 3000, ViewSamples(1, sizes=((96, 128),)), DepthLoss(), learning(*MATCHER), learning_rate=1e-3)
+    Phase("depth", 3000, ViewSamples(1, sizes=((96, 128),)), DepthLoss(), MATCHER, learning_rate=1e-3)
 
 Samples are in `samples.py` and `crops.py`, losses in `losses.py`, the loop and its optimizer in `loop.py`.
 """
@@ -19,9 +19,6 @@ from ssplat_jax.training.anchors import StreamParts
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.losses import AnchorLoss, CropLoss, DepthLoss, RenderingLoss
 from ssplat_jax.training.samples import CaptureMix, TrainingStart, ViewSamples
-
-Rates = tuple[tuple[str, float], ...]
-"""Paths of parts of the parameters, such as "encoder/pretrained", with factors of the learning rate."""
 
 MATCHER = ("encoder", "cost_volume", "upsampler")
 """Stages that end in the depth map; not every network has all of them. They learn from depth alone."""
@@ -58,22 +55,12 @@ class Phase:
     steps: int  # number of steps
     samples: Samples  # samples that the steps learn from
     loss: Loss  # loss that they lower
-    rates: Rates
-    """Parts that learn, with factors of the learning rate; the longest path that fits counts. All others are constants:
-    weight decay would move even those that the loss does not reach. Parts that the network lacks are skipped."""
+    stages: tuple[str, ...]
+    """Stages that learn. All others are constants: weight decay would move even those that the loss does not reach.
+    Stages that the network lacks are skipped."""
     learning_rate: float  # peak of the learning rate, to which it warms up and from which it decays by a cosine
     final_share: float = 0.1  # learning rate at the end of the phase, as a fraction of the peak
     warmup_steps: int = 50  # steps of linear warm-up
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """Stages of which a part learns."""
-        return tuple(dict.fromkeys(path.partition("/")[0] for path, _ in self.rates))
-
-    def rate(self, path: str) -> float:
-        """Factor of the learning rate of the parameters at `path`; 0 where nothing learns."""
-        fitting = [(len(part), rate) for part, rate in self.rates if path == part or path.startswith(f"{part}/")]
-        return max(fitting, default=(0, 0.0))[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,12 +107,7 @@ def describe(value: Any) -> Any:
     return [describe(part) for part in value] if isinstance(value, tuple) else value
 
 
-def learning(*parts: str) -> Rates:
-    """Parts that learn at the full rate."""
-    return tuple((part, 1.0) for part in parts)
-
-
-_depth = functools.partial(Phase, loss=DepthLoss(), rates=learning(*MATCHER))
+_depth = functools.partial(Phase, loss=DepthLoss(), stages=MATCHER)
 # Closer to the size of streamed images, and portrait too. Streamed video is interleaved until views are 3 % of the
 # depth apart or more.
 _LARGER = ViewSamples(1, ((160, 224), (224, 160)), steps_of_depth=(0.02, 0.4))
@@ -160,7 +142,7 @@ _FOUR_CHUNKS = ViewSamples(4, ((96, 128),), num_targets=4, steps_of_depth=(0.01,
 _STREAMS = StreamParts(ViewSamples(8, ((128, 192), (224, 320)), steps_of_depth=(0.003, 0.15)))
 
 ANCHOR_RECIPE = Recipe(
-    phases=(Phase("anchor", 1500, _STREAMS, AnchorLoss(), learning("hpda"), 2e-3, final_share=0.02),),
+    phases=(Phase("anchor", 1500, _STREAMS, AnchorLoss(), ("hpda",), 2e-3, final_share=0.02),),
     untrained=("hpda",),
 )
 """Trains HPDA's learned anchor of weights whose other stages stay as they are. Longer training, on streams in order
@@ -169,13 +151,13 @@ alone, trusts the cache too far (docs/model_card.md)."""
 # The matcher is trained by then. Without its backward pass a step costs a third, and rendering would teach it less
 # about depth than depth supervision did.
 STREAM_RECIPE = Recipe(
-    phases=(Phase("stream", 400, _FOUR_CHUNKS, RenderingLoss(), learning(*AFTER_MATCHER), 1e-3, final_share=0.02),)
+    phases=(Phase("stream", 400, _FOUR_CHUNKS, RenderingLoss(), AFTER_MATCHER, 1e-3, final_share=0.02),)
 )
 """Trains the stages behind a trained matcher. The shipped weights do not include it, because it lowered the scores
 of captures (docs/model_card.md)."""
 
 EVIDENCE_RECIPE = Recipe(
-    phases=(Phase("evidence", 480, Crops(), CropLoss(), learning("evidence"), 5e-3, final_share=0.0, warmup_steps=20),),
+    phases=(Phase("evidence", 480, Crops(), CropLoss(), ("evidence",), 5e-3, final_share=0.0, warmup_steps=20),),
     adam_b2=0.999,
     weight_decay=1e-3,
     clip_norm=3.0,
@@ -201,7 +183,7 @@ _PAPER_PHASE = Phase(
     100_000,
     _PAPER_VIEWS,
     _PAPER_LOSS,
-    learning(*MATCHER, *AFTER_MATCHER),
+    (*MATCHER, *AFTER_MATCHER),
     1e-4,
     final_share=1.0,
     warmup_steps=1,

@@ -14,7 +14,7 @@ import pytest
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.training import loop
-from ssplat_jax.training.recipe import RECIPES, Recipe, learning
+from ssplat_jax.training.recipe import AFTER_MATCHER, MATCHER, RECIPES, Recipe
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 from tests.training import problems
@@ -41,8 +41,7 @@ def formulas(recipe):
         start = SimpleNamespace(seed=recipe.seed, params=problems.start_params())
         make = phase.samples.open(start)  # samples may depend on the first parameters
         numbers = np.float64(make(step, place))
-        paths = {name: name.strip("[]'").replace("']['", "/") for name in x}
-        learns = {name: paths[name].split("/")[0] in phase.stages for name in x}
+        learns = {name: name.split("'")[1] in phase.stages for name in x}
         gradients = {name: 2 * phase.loss.weight * (x[name] - numbers) * learns[name] for name in x}
         norm = math.sqrt(sum((gradient**2).sum() for gradient in gradients.values()))
         if math.isfinite(norm):
@@ -53,7 +52,7 @@ def formulas(recipe):
                 square[name] = recipe.adam_b2 * square[name] + (1 - recipe.adam_b2) * clipped**2
                 unbiased = mean[name] / (1 - 0.9**updates)
                 root = np.sqrt(square[name] / (1 - recipe.adam_b2**updates))
-                rate = scheduled(phase, place) * phase.rate(paths[name])
+                rate = scheduled(phase, place) * learns[name]
                 x[name] = x[name] - rate * (unbiased / (root + 1e-8) + recipe.weight_decay * x[name])
         average = {name: recipe.ema_decay * average[name] + (1 - recipe.ema_decay) * x[name] for name in x}
     average = {name: value / (1 - recipe.ema_decay ** len(steps)) for name, value in average.items()}
@@ -61,7 +60,7 @@ def formulas(recipe):
 
 
 def test_steps_follow_the_formulas(tmp_path):
-    """Clipping, AdamW, schedule, rates of parts, average, and a skipped step, through two phases."""
+    """Clipping, AdamW, schedule, stages that learn, average, and a skipped step, through two phases."""
     done = problems.train_quadratic(tmp_path)
     params, average, num_skipped = formulas(problems.QUADRATIC)
     assert int(done.state.optimizer[0].total_notfinite) == num_skipped == 1
@@ -114,7 +113,7 @@ def test_a_rendering_phase_moves_all_its_stages(tmp_path):
 
 
 def test_recipes_that_the_configuration_or_the_samples_do_not_fit_are_refused(tmp_path):
-    untrainable = Recipe((dataclasses.replace(problems.FIRST, rates=learning("evidence")),))
+    untrainable = Recipe((dataclasses.replace(problems.FIRST, stages=("evidence",)),))
     for recipe, words in (
         (untrainable, "wanted a configuration with evidence"),
         (RECIPES["paper"], "captures that share all steps"),
@@ -125,13 +124,12 @@ def test_recipes_that_the_configuration_or_the_samples_do_not_fit_are_refused(tm
 
 
 def test_the_paper_recipe_takes_steps_of_plain_adamw(tmp_path):
-    """100,000 steps at a constant 1e-4: no warm-up, decay, clipping, average, or slower part; PyTorch's defaults."""
+    """100,000 steps at a constant 1e-4: no warm-up, decay, clipping, average; PyTorch's defaults."""
     recipe = RECIPES["paper"]
     (phase,) = recipe.phases
-    assert phase.steps == 100_000 and phase.rate("evidence") == phase.rate("encoders") == 0.0
-    for part in ("encoder/pretrained/x", "encoder/cnn", "cost_volume", "hpda/w", "decoder/w"):
-        rate = loop.schedule(recipe, (phase.rate(part),))
-        np.testing.assert_allclose([rate(step) for step in (0, 1, 50_000, 99_999)], 1e-4, rtol=1e-6)
+    assert phase.steps == 100_000 and phase.stages == (*MATCHER, *AFTER_MATCHER)
+    rate = loop.schedule(recipe, (True,))
+    np.testing.assert_allclose([rate(step) for step in (0, 1, 50_000, 99_999)], 1e-4, rtol=1e-6)
     assert (recipe.weight_decay, recipe.adam_b2, recipe.clip_norm, recipe.ema_decay) == (0.01, 0.999, None, 0)
     long = problems.Squares(1e4)  # its gradient is long
     short = dataclasses.replace(phase, steps=9, samples=problems.Numbers(), loss=long)
