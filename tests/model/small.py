@@ -134,12 +134,6 @@ def step(params, cache, chunk):
     return after, prediction.output
 
 
-def predict(params, cache, chunk):
-    """The prediction of a chunk."""
-    (_, (prediction, _)), _ = program()(params, cache, chunk)
-    return prediction
-
-
 def gradients(cache, chunk):
     """The gradients of `program` with the random parameters."""
     return program()(params(), cache, chunk)[1]

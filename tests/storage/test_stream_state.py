@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache.state import init_cache
-from ssplat_jax.core.atomic import previous_path, write_atomic
+from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.errors import InputError, StorageError
-from ssplat_jax.storage.saved_states import load_newest_state, load_state, save_state
+from ssplat_jax.storage.saved_states import load_state, save_state
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax
 
 HEADER = {"config": CONFIG.to_dict(), "chunks": 3, "note": "ω"}
@@ -71,20 +71,6 @@ def test_no_damaged_foreign_or_missing_file_is_loaded(saved, tmp_path):
     for name in ("foreign.npz", "absent.npz"):
         with pytest.raises(StorageError, match=name):
             load_state(tmp_path / name)
-
-
-def test_the_previous_state_is_used_when_the_newest_is_corrupt(tmp_path):
-    path, old, new = tmp_path / "state.npz", stream(CHUNKS[:1]), stream(CHUNKS[:2])
-    save_state(path, old, {"chunks": 1})
-    save_state(path, new, {"chunks": 2})
-    assert load_newest_state(path)[1:] == ({"chunks": 2}, None)
-    path.write_bytes(path.read_bytes()[:-1])
-    cache, header, error = load_newest_state(path)
-    assert header == {"chunks": 1} and "state.npz" in str(error)
-    assert_identical(cache, old)
-    previous_path(path).write_bytes(b"damaged too")
-    with pytest.raises(StorageError, match=r"state\.npz: the file is corrupt"):
-        load_newest_state(path)
 
 
 @contextlib.contextmanager

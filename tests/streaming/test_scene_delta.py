@@ -10,7 +10,6 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.compact import GaussianHead
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.chunk_records import load_delta, save_delta
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
 from tests.cache.streams import CAPACITY, CONFIG, PLACES, VARIANTS, Recipe, fuse, to_jax, written_rows
 
@@ -95,12 +94,3 @@ def test_a_delta_holds_the_changed_rows_alone(monkeypatch):
     known = jax.tree.map(jnp.copy, cache)
     cache = fuse(cache, chunk(1), config)
     assert set(SceneFeed(model, params, known).update(cache).rows) == written_rows(cache)
-
-
-def test_deltas_come_back_from_disk_to_the_last_bit(tmp_path):
-    model, params = StreamSplat(CONFIG), decoder_params(CONFIG)
-    cache = fuse(init_cache(CONFIG, CAPACITY), chunk(1), CONFIG)
-    delta = SceneFeed(model, params).update(cache)
-    save_delta(tmp_path / "00000.npz", delta)
-    read, _ = load_delta(tmp_path / "00000.npz")
-    jax.tree.map(np.testing.assert_array_equal, vars(read), vars(delta))
