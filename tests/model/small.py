@@ -38,6 +38,7 @@ MODEL = StreamSplat(CONFIG)
 HEIGHT, WIDTH = 24, 30  # padded to 32 x 32, so that every test has cells outside the image
 
 
+@functools.cache
 def random_params(config: StreamConfig, seed: int = 0) -> dict:
     """Random parameters, without the zero-initialized layers of untrained ones, which would hide errors.
 
@@ -54,7 +55,7 @@ def random_params(config: StreamConfig, seed: int = 0) -> dict:
         return jnp.asarray(values, jnp.float32)
 
     shapes = jax.eval_shape(StreamSplat(config).init, jax.random.key(0))
-    with jax.ensure_compile_time_eval():  # the first caller may be inside jit, and `params` keeps what it got
+    with jax.ensure_compile_time_eval():  # the first caller may be inside jit, and what it got is kept
         return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
@@ -75,10 +76,8 @@ def draw_with_numpy(patch, compiled: tuple[str, ...] = ()) -> None:
     patch.setattr(network, "_init_stage", drawn)
 
 
-@functools.cache
-def params() -> dict:
-    """Random parameters of `CONFIG`."""
-    return random_params(CONFIG)
+params = functools.partial(random_params, CONFIG)
+"""Random parameters of `CONFIG`."""
 
 
 def chunk(seed: int = 0, *, views: int = 3, baseline: float = 0.2, height: int = HEIGHT, width: int = WIDTH) -> Chunk:
@@ -104,39 +103,35 @@ def chunk_of(images, viewmats, K, near: float, far: float) -> Chunk:
     return Chunk(single(images), single(viewmats), single(Ks), valid, single(near), single(far))
 
 
-@functools.cache
-def program():
-    """The step with gradients in one program, `(params, cache, chunk) -> (value, results), gradients`.
+@jax.jit
+@functools.partial(jax.value_and_grad, argnums=(0, 1, 2, 3, 4), has_aux=True)
+def _differentiated(params, images, viewmats, Ks, remembered, cache, chunk):
+    before = replace(cache, means=remembered[0], feats=remembered[1])
+    prediction = MODEL.predict(params, before, replace(chunk, images=images, viewmats=viewmats, Ks=Ks))
+    scene = MODEL.decode_tokens(params, prediction.tokens)
+    leaves = (scene, prediction.tokens.confidences, prediction.log_depths)
+    results = prediction, MODEL.update_cache(cache, prediction)
+    return sum(jnp.mean(jnp.sin(x)) for x in jax.tree.leaves(leaves)), results
 
-    Results are the prediction and the cache after it. The gradients of a sum over the outputs are with respect to
-    parameters, images, poses, intrinsics, and the positions and features in the cache.
+
+def program(params, cache, chunk):
+    """The step with gradients in one program: `(value, (prediction, cache after it)), gradients`.
+
+    The gradients of a sum over the outputs are with respect to parameters, images, poses, intrinsics, and the positions
+    and features in the cache.
     """
-
-    def total(params, images, viewmats, Ks, remembered, cache, chunk):
-        before = replace(cache, means=remembered[0], feats=remembered[1])
-        prediction = MODEL.predict(params, before, replace(chunk, images=images, viewmats=viewmats, Ks=Ks))
-        scene = MODEL.decode_tokens(params, prediction.tokens)
-        leaves = (scene, prediction.tokens.confidences, prediction.log_depths)
-        results = prediction, MODEL.update_cache(cache, prediction)
-        return sum(jnp.mean(jnp.sin(x)) for x in jax.tree.leaves(leaves)), results
-
-    function = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2, 3, 4), has_aux=True))
-
-    def run(params, cache, chunk):
-        return function(params, chunk.images, chunk.viewmats, chunk.Ks, (cache.means, cache.feats), cache, chunk)
-
-    return run
+    return _differentiated(params, chunk.images, chunk.viewmats, chunk.Ks, (cache.means, cache.feats), cache, chunk)
 
 
 def step(params, cache, chunk):
     """The cache after a chunk, and the output."""
-    (_, (prediction, after)), _ = program()(params, cache, chunk)
+    (_, (prediction, after)), _ = program(params, cache, chunk)
     return after, prediction.output
 
 
 def gradients(cache, chunk):
     """The gradients of `program` with the random parameters."""
-    return program()(params(), cache, chunk)[1]
+    return program(params(), cache, chunk)[1]
 
 
 @functools.cache

@@ -20,20 +20,16 @@ CONFIG = preset("tiny").replace(capacity=128, gaussians_per_token=4, detail=Fals
 NUM = 5
 
 
-def shapes(num: int = NUM) -> TokenShapes:
+def shapes() -> TokenShapes:
     """Shapes of pivots, all different."""
-    x = jnp.linspace(-1.0, 1.0, num)
-    return TokenShapes(
-        logit_opacities=x, raw_scales=x[:, None] * jnp.ones(3), quats=jnp.ones((num, 4)), sh=jnp.zeros((num, 1, 3))
-    )
+    x, sh = jnp.linspace(-1.0, 1.0, NUM), jnp.zeros((NUM, 1, 3))
+    return TokenShapes(logit_opacities=x, raw_scales=x[:, None] * jnp.ones(3), quats=jnp.ones((NUM, 4)), sh=sh)
 
 
-def evidence(value: float = 1.0, num: int = NUM) -> decoder.Evidence:
+def evidence(value: float = 1.0) -> decoder.Evidence:
     """Evidence whose fields all have one value."""
-    each = jnp.full(num, value)
-    return decoder.Evidence(
-        jnp.full((num, NUM_OBSERVED), value), each, each, each, each, each, jnp.full((num, 12), value)
-    )
+    each = jnp.full(NUM, value)
+    return decoder.Evidence(jnp.full((NUM, NUM_OBSERVED), value), *[each] * 5, jnp.full((NUM, 12), value))
 
 
 @functools.cache

@@ -1,7 +1,5 @@
 """Exposure of views relative to the scene: the median of color ratios on common surfaces, and its limits."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,15 +18,11 @@ SIDE, VIEWS = 64, 3
 CELLS = SIDE // 4
 
 
-@functools.cache
-def estimate():
-    """The jitted stage over images: `(history, log_depths, confidences, images, valid) -> exposures`."""
-
-    def run(remembered, log_depths, confidences, images, valid):
-        views = prepare_views(replace(chunk(height=SIDE, width=SIDE), images=images, valid=valid), TRUSTING)
-        return estimate_exposures(remembered, log_depths, confidences, views, TRUSTING)
-
-    return jax.jit(run)
+@jax.jit
+def estimate(remembered, log_depths, confidences, images, valid):
+    """The exposures of views with these images."""
+    views = prepare_views(replace(chunk(height=SIDE, width=SIDE), images=images, valid=valid), TRUSTING)
+    return estimate_exposures(remembered, log_depths, confidences, views, TRUSTING)
 
 
 def scene(seed: int = 0):
@@ -46,7 +40,7 @@ def exposures(remembered, colors, depths, *, seen_depths=None, confidences=0.9, 
         log_depths = jnp.asarray(np.log(seen_depths), jnp.float32)
     trust = jnp.asarray(np.broadcast_to(confidences, depths.shape), jnp.float32)
     valid = jnp.ones(VIEWS, bool) if valid is None else jnp.asarray(valid)
-    return np.asarray(estimate()(known, log_depths, trust, jnp.asarray(images, jnp.float32), valid))
+    return np.asarray(estimate(known, log_depths, trust, jnp.asarray(images, jnp.float32), valid))
 
 
 def oracle(remembered, colors, depths, seen_depths, confidences, mask):
@@ -104,15 +98,11 @@ def test_values_that_are_not_finite_are_not_compared(bad):
 
 def test_exposures_have_no_gradient():
     remembered, depths = scene()
-
-    def total(colors, log_depths):
-        images = jnp.repeat(jnp.repeat(colors, 4, axis=1), 4, axis=2)
-        known = history(depths, np.full(depths.shape, 0.8), colors=remembered)
-        views = prepare_views(replace(chunk(height=SIDE, width=SIDE), images=images), TRUSTING)
-        return estimate_exposures(known, log_depths, jnp.full(depths.shape, 0.9), views, TRUSTING).sum()
-
-    inputs = (jnp.asarray(0.5 * remembered, jnp.float32), jnp.asarray(np.log(depths), jnp.float32))
-    assert not any(np.any(np.asarray(g)) for g in jax.jit(jax.grad(total, argnums=(0, 1)))(*inputs))
+    known, trust = history(depths, np.full(depths.shape, 0.8), colors=remembered), jnp.full(depths.shape, 0.9)
+    images = jnp.asarray(np.repeat(np.repeat(0.5 * remembered, 4, axis=1), 4, axis=2), jnp.float32)
+    total = lambda images, log_depths: estimate(known, log_depths, trust, images, jnp.ones(VIEWS, bool)).sum()  # noqa: E731
+    gradients = jax.grad(total, argnums=(0, 1))(images, jnp.asarray(np.log(depths), jnp.float32))
+    assert not any(np.any(np.asarray(g)) for g in gradients)
 
 
 GAINS = np.array([[0.5, 0.7, 1.0], [1.0, 1.0, 1.0], [2.0, 1.5, 1.25]], np.float32)

@@ -7,34 +7,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.model.cgfi import Aggregator, inject_features, num_hints
+from ssplat_jax.model.cgfi import inject_features
 from ssplat_jax.model.compact import mix_tokens
 from ssplat_jax.model.mixer import nearest_tokens
+from ssplat_jax.model.network import init_params
 from ssplat_jax.model.views import prepare_views
-from tests.model.small import CONFIG, chunk, history, params
+from tests.model.small import CONFIG, chunk, history, params, random_params
 
 C = CONFIG.network.token_width
 GRID = (3, 8, 8)
+CONCAT = CONFIG.replace(residual_cgfi=False)
+_INJECT, _MIX = jax.jit(inject_features, static_argnums=5), jax.jit(mix_tokens, static_argnums=5)
 
 
 def maps(seed: int, *channels):
     return jnp.asarray(np.random.default_rng(seed).normal(size=(*GRID, *channels)), jnp.float32)
 
 
-def fresh(config=CONFIG) -> dict:
-    hints = jnp.zeros((*GRID, num_hints(config)))
-    return {"cgfi": jax.jit(Aggregator(config).init)(jax.random.key(0), hints[..., :C], hints, views().valid)["params"]}
-
-
 @functools.cache
 def views():
     return jax.jit(prepare_views, static_argnums=1)(chunk(), CONFIG)
-
-
-CONCAT = CONFIG.replace(residual_cgfi=False)
-
-
-_INJECT = jax.jit(inject_features, static_argnums=5)
 
 
 def inject(weights, feats, past, confidences, config=CONFIG):
@@ -46,22 +38,16 @@ def past(seed: int = 1):
     return history(rng.uniform(1, 5, GRID), np.full(GRID, 0.7), feats=rng.normal(size=(*GRID, C)))
 
 
-def concat_params() -> dict:
-    """Random weights of the concatenated form."""
-    rng = np.random.default_rng(0)
-    draw = lambda x: jnp.asarray(rng.normal(size=x.shape) / np.sqrt(np.prod(x.shape[:-1]) or 1), jnp.float32)  # noqa: E731
-    return jax.tree.map(draw, jax.eval_shape(lambda: fresh(CONCAT)))
-
-
 def test_cgfi_is_the_identity_before_training():
     for config in (CONFIG, CONCAT):
-        np.testing.assert_array_equal(inject(fresh(config), maps(0, C), past(), 0.4, config), maps(0, C))
+        untrained = init_params(jax.random.key(0), config, only=("cgfi",))
+        np.testing.assert_array_equal(inject(untrained, maps(0, C), past(), 0.4, config), maps(0, C))
 
 
-@pytest.mark.parametrize(("config", "weights"), [(CONFIG, params), (CONCAT, concat_params)], ids=["residual", "concat"])
-def test_cgfi_uses_history_only_where_confidence_is_below_one(config, weights):
+@pytest.mark.parametrize("config", [CONFIG, CONCAT], ids=["residual", "concat"])
+def test_cgfi_uses_history_only_where_confidence_is_below_one(config):
     def effect_of_history(confidence):
-        here, other = (inject(weights(), maps(0, C), past(seed), confidence, config) for seed in (1, 2))
+        here, other = (inject(random_params(config), maps(0, C), past(seed), confidence, config) for seed in (1, 2))
         return float(jnp.abs(here - other).max())
 
     assert effect_of_history(1.0) == 0.0
@@ -90,9 +76,6 @@ def test_neighbors_are_the_nearest_with_the_token_first(radius):
         if len(wanted) == 3:
             np.testing.assert_allclose(sorted(map(distance, found[i, 1:])), wanted, rtol=1e-6)
             assert usable[found[i, 1:]].all()
-
-
-_MIX = jax.jit(mix_tokens, static_argnums=5)
 
 
 def mix(feats, positions, inside, valid):

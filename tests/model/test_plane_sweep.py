@@ -43,8 +43,6 @@ def wall_chunk() -> Chunk:
 
 sweep = jax.jit(lambda features, views: plane_sweep(features, views, CONFIG))
 encoded = jax.jit(lambda params, views: encode(params["encoder"], views, CONFIG))
-
-
 VIEWS = functools.cache(lambda: jax.jit(prepare_views, static_argnums=1)(wall_chunk(), CONFIG))
 
 

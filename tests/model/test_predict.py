@@ -63,7 +63,7 @@ HARD_MEMORIES = {  # cache, and raw strength of the anchor
 
 def check_prediction(given, cache, weights):
     """Checks values, gradients, distributions and ranges of a chunk, and the cache after it."""
-    (value, (prediction, after)), gradient = small.program()(weights, cache, given)
+    (value, (prediction, after)), gradient = small.program(weights, cache, given)
     assert small.finite((value, gradient, prediction, after))
     probs = np.asarray(prediction.distribution.probs, np.float64)
     assert (probs >= 0).all()

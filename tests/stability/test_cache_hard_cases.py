@@ -25,6 +25,8 @@ pytestmark = pytest.mark.usefixtures("compiled_plainly")
 CACHE = streams.PAIRS  # a third token in a voxel merges
 ANY = CACHE.replace(min_confidence=0.0)
 EMPTY = init_cache(CACHE, streams.CAPACITY)
+# Without carving pivots of any confidence are seen, down to those whose square underflows.
+READ = jax.jit(functools.partial(project, config=CACHE.replace(carving=False)))
 IN_A_VOXEL = [[0.11, 0.10, 0.10], [0.12, 0.10, 0.10], [0.17, 0.10, 0.10]]
 
 
@@ -37,17 +39,11 @@ def fused(tokens, config=CACHE, cache=EMPTY) -> VoxelCache:
     return cache
 
 
-@functools.cache
-def reading():
-    # Without carving pivots of any confidence are seen, down to those whose square underflows.
-    return jax.jit(functools.partial(project, config=CACHE.replace(carving=False)))
-
-
 def test_accepted_omega_0_is_averaged_evenly_and_invisible_and_omega_1_decides_alone():
     cache = fused(tokens_at(IN_A_VOXEL, confidences=0.0), ANY)
     np.testing.assert_allclose(cache.means[0, 0], np.mean(IN_A_VOXEL[:2], axis=0), atol=1e-7)
     camera = replace(front_camera(), viewmats=jnp.eye(4).at[2, 3].set(2.0)[None])
-    assert not any(np.any(np.asarray(x)) for x in jax.tree.leaves(reading()(cache, camera)))
+    assert not any(np.any(np.asarray(x)) for x in jax.tree.leaves(READ(cache, camera)))
     cache = fused(tokens_at(IN_A_VOXEL, confidences=jnp.array([1.0, 0.0, 0.5])), ANY)
     np.testing.assert_array_equal(cache.means[0, 0], np.float32(IN_A_VOXEL[0]))
     assert cache.confidences[0, 0] == 1
@@ -71,7 +67,7 @@ SEEN = {
 @pytest.mark.parametrize("name", SEEN)
 def test_hard_projection(name):
     means, confidences, wanted = SEEN[name]
-    seen = reading()(with_pivots(means, confidences), front_camera())
+    seen = READ(with_pivots(means, confidences), front_camera())
     assert finite(seen)
     assert (seen.confidences >= 0).all() and (seen.confidences <= 1 + 1e-6).all()
     if wanted is not None:
@@ -83,7 +79,7 @@ def test_a_camera_far_from_the_origin_stays_finite():
     """At 6.4e6 float32 has a spacing of 0.5: depths are right to that, and tokens are counted as out of range."""
     far, one = 6.4e6, front_camera()
     camera = Camera(viewmats=jnp.eye(4).at[2, 3].set(-far)[None], Ks=one.Ks, width=one.width, height=one.height)
-    seen = reading()(with_pivots([[0, 0, far + 4.0]]), camera)
+    seen = READ(with_pivots([[0, 0, far + 4.0]]), camera)
     assert finite(seen) and seen.depths[0, 3, 4] == pytest.approx(4.0, abs=0.5)
     after = fused(tokens_at([[0, 0, far + 4.0]]))
     assert int(after.stats.num_out_of_range) == 1 and int(after.num_voxels) == 0
