@@ -1,7 +1,5 @@
 """`ssplat render`: pictures of a scene file from a capture's cameras, and a film."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,6 +14,7 @@ from ssplat_jax.runs.open_run import save_poses
 from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.command_fixture import make_capture, run
+from tests.data.capture_fixture import with_poses
 
 LEVEL = 1.0 / 255
 FILM_DB = 38.0  # x264's losses, of the brightness: colors have half the resolution
@@ -71,13 +70,11 @@ def test_pictures_are_what_the_cameras_see_of_the_refined_scene(tmp_path, captur
 def test_a_run_is_drawn_from_its_adjusted_poses(tmp_path, capture):
     folder, opened = RunFolder(tmp_path / "run"), ss.open_capture(capture)
     ss.save_ply(folder.scene, scene())
-    shift = np.eye(4)
-    shift[0, 3] = 0.1
-    poses = {i: frame.camtoworld @ shift for i, frame in enumerate(opened.frames)}
-    save_poses(folder, opened.digest(range(3)), poses)
+    poses = opened.camtoworlds
+    poses[:, :3, 3] += 0.1 * poses[:, :3, 0]
+    save_poses(folder, opened.digest(range(3)), dict(enumerate(poses)))
     assert run("render", folder.path, capture, "--max-views", "1", "--out", tmp_path / "out", "--quiet") == 0
-    frames = tuple(dataclasses.replace(frame, camtoworld=poses[i]) for i, frame in enumerate(opened.frames))
-    expected = wanted(dataclasses.replace(opened, frames=frames), ss.load_ply(folder.scene), 0, "mip")
+    expected = wanted(with_poses(opened, poses), ss.load_ply(folder.scene), 0, "mip")
     np.testing.assert_allclose(picture(tmp_path / "out" / "views" / "00000.png"), expected, atol=0.51 * LEVEL)
 
 

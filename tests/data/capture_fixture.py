@@ -1,4 +1,6 @@
-"""Small captures in memory, and the stream frame of a capture's first camera."""
+"""Small captures in memory, captures with other poses, and the stream frame of the first camera."""
+
+import dataclasses
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,6 +23,12 @@ def smooth_capture(num_frames=6, height=48, width=64):
         frames.append(Frame(name=str(i), camtoworld=pose, K=K, width=width, height=height))
     pixels = ArrayPixels(images=images.astype(np.float32), depths=depths.astype(np.float32))
     return Capture(name="smooth", format="memory", frames=tuple(frames), pixels=pixels, width=width, height=height)
+
+
+def with_poses(capture, camtoworlds):
+    """The capture with other poses."""
+    pairs = zip(capture.frames, camtoworlds, strict=True)
+    return dataclasses.replace(capture, frames=tuple(dataclasses.replace(f, camtoworld=pose) for f, pose in pairs))
 
 
 def frame_of(capture, scale=1.0):

@@ -12,6 +12,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import CONVENTIONS, USUAL, Convention, with_options
 from ssplat_jax.data.sparse_matches import fit_poses, keypoints_of, pose_warning
 from tests.badinputs.cases import make_capture
+from tests.data.capture_fixture import with_poses
 from tests.data.planes_fixture import two_planes
 
 NAMES = [f"{c.axes}-{c.poses}" for c in CONVENTIONS]
@@ -29,8 +30,7 @@ def keypoints(room):
 
 def written_as(capture: Capture, convention: Convention) -> Capture:
     """The capture that a reader of OpenCV camera-to-world poses makes of files in `convention`."""
-    frames = (dataclasses.replace(f, camtoworld=convention.from_opencv(f.camtoworld)) for f in capture.frames)
-    return dataclasses.replace(capture, frames=tuple(frames))
+    return with_poses(capture, map(convention.from_opencv, capture.camtoworlds))
 
 
 @pytest.mark.parametrize("written", CONVENTIONS, ids=NAMES)

@@ -1,7 +1,5 @@
 """Scores: holes are filled with the colors around; over black they cost what they are worth."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +13,8 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation.metrics import psnr, ssim
 from ssplat_jax.evaluation.scoring import baselines, nearest_views, score_view
+from tests.core.test_rotations import rodrigues
+from tests.data.capture_fixture import with_poses
 from tests.rasterizer.scenes import balls
 
 
@@ -61,9 +61,8 @@ def test_an_uncovered_view_is_scored_on_the_mean_color(capture):
 
 def test_a_novel_view_has_the_mean_exposure_of_its_neighbors(capture):
     frame, scene = capture.stream_frame(StreamConfig(), (0, 1, 3, 4)), gaussians([[0.2, 0.4, 0.6]], [0.9])
-    exposures = {
-        i: np.array(e, np.float64) for i, e in {0: [9, 9, 9], 1: [0.5, 1, 2], 3: [0.5, 1, 1], 4: [1, 1, 4]}.items()
-    }
+    told = {0: [9, 9, 9], 1: [0.5, 1, 2], 3: [0.5, 1, 1], 4: [1, 1, 4]}
+    exposures = {i: np.array(e, np.float64) for i, e in told.items()}
     assert nearest_views(capture, 2, tuple(exposures))[-1] == 0  # three are averaged
     view = score_view(scene, capture, 2, frame, exposures)
     score, color = view.score, view.color
@@ -87,14 +86,10 @@ def test_literal_scores_are_at_the_middle_exposure_over_black(capture):
 
 def test_nearness_counts_centers_and_angles(capture):
     """By the extent, 2 here, of the candidates: half of it is as far as a turn by half a radian."""
-    turns = {0: (0.0, 0.0), 1: (2.0, 0.0), 2: (0.5, 0.0), 3: (0.0, 0.4), 4: (0.0, 1.3)}  # x and angle
-    frames = []
-    for (x, angle), frame in zip(turns.values(), capture.frames, strict=True):
-        pose = np.eye(4)
-        pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-        pose[0, 3] = x
-        frames.append(dataclasses.replace(frame, camtoworld=pose))
-    turned = dataclasses.replace(capture, frames=tuple(frames))
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[1:3, 0, 3] = 2.0, 0.5
+    poses[3:, :3, :3] = [rodrigues([0, 1, 0], angle) for angle in (0.4, 1.3)]
+    turned = with_poses(capture, poses)
     assert nearest_views(turned, 0, (1, 2, 3, 4)) == [2, 3, 1, 4]  # 0.25, 0.4, 1.0, 1.3
 
 

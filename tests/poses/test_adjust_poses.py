@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.posed_image import Frame
 from ssplat_jax.poses.adjust_poses import adjust_poses
+from tests.data.capture_fixture import with_poses
 from tests.poses.room_fixture import HEIGHT, WIDTH, K, pictures, walk
 from tests.poses.test_bundle_adjustment import relative_turns
 
@@ -26,14 +27,12 @@ def exact():
 
 @pytest.fixture(scope="module")
 def wrong(exact):
-    rng, frames = np.random.default_rng(0), list(exact.frames)
+    rng, poses = np.random.default_rng(0), exact.camtoworlds
     for i in CONTEXT[1:]:
         turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-        pose = frames[i].camtoworld.copy()
-        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(0.5) * turn).as_matrix()
-        pose[:3, 3] += 0.02 * shift  # 1 % of the depth
-        frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
-    return dataclasses.replace(exact, frames=tuple(frames))
+        poses[i, :3, :3] @= Rotation.from_rotvec(np.radians(0.5) * turn).as_matrix()
+        poses[i, :3, 3] += 0.02 * shift  # 1 % of the depth
+    return with_poses(exact, poses)
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +64,12 @@ def test_the_frame_and_the_unit_of_the_poses_stay_and_frames_that_are_not_named_
     blind = ArrayPixels(images, np.zeros(images.shape[:3], np.float32))
     turn, scale, shift = Rotation.from_euler("xyz", [0.3, 1.0, -0.4]).as_matrix(), 1000.0, np.array([1e7, 2e6, -3e6])
 
-    def moved_to(pose):
-        out = pose.copy()
-        out[:3, :3], out[:3, 3] = turn @ pose[:3, :3], scale * turn @ pose[:3, 3] + shift
-        return out
+    def moved(poses):
+        poses[:, :3, :3], poses[:, :3, 3] = turn @ poses[:, :3, :3], scale * poses[:, :3, 3] @ turn.T + shift
+        return poses
 
-    frames = tuple(dataclasses.replace(f, camtoworld=moved_to(f.camtoworld)) for f in wrong.frames)
-    there = adjust_poses(dataclasses.replace(wrong, frames=frames, pixels=blind), CONTEXT).capture.camtoworlds
-    here = np.stack([moved_to(pose) for pose in adjusted.capture.camtoworlds])
+    spoiled = dataclasses.replace(with_poses(wrong, moved(wrong.camtoworlds)), pixels=blind)
+    there, here = adjust_poses(spoiled, CONTEXT).capture.camtoworlds, moved(adjusted.capture.camtoworlds)
     np.testing.assert_allclose(there[:, :3, :3], here[:, :3, :3], atol=1e-5)
     np.testing.assert_allclose(there[:, :3, 3], here[:, :3, 3], atol=0.05)
 

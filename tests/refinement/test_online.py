@@ -19,13 +19,13 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.metrics import psnr
-from ssplat_jax.model.compact import GaussianHead
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import online
 from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.streaming.session import Session
+from tests.cache.streams import tokens_at
 from tests.model.small import chunk_of, side_by_side
 from tests.rasterizer.scenes import balls
 from tests.streaming.narrow_model import assert_same_bits
@@ -37,6 +37,7 @@ CONFIG = StreamConfig().replace(
     token_width=4, capacity=128, min_confidence=0.3, steps_per_chunk=3, overflow="drop_new", voxel_size=0.3
 )
 MODEL = StreamSplat(CONFIG)
+SHIFTS = (0.0, 0.1, -0.1, 0.2)
 
 
 @pytest.fixture(autouse=True)
@@ -44,13 +45,9 @@ def four_key_views(monkeypatch):
     monkeypatch.setattr("ssplat_jax.cache.state.NUM_KEY_VIEWS", 4)
 
 
-SHIFTS = (0.0, 0.1, -0.1, 0.2)
-
-
 @functools.cache
 def params() -> dict:
-    decoder = GaussianHead(CONFIG).init(jax.random.key(0), jnp.zeros((1, 4)))["params"]
-    return {"decoder": decoder, **init_params(jax.random.key(1), CONFIG, only=("evidence",))}
+    return init_params(jax.random.key(0), CONFIG, only=("decoder", "evidence"))
 
 
 def wall_colors(points: np.ndarray) -> np.ndarray:
@@ -78,22 +75,12 @@ def tokens(seed: int = 0, behind: bool = False) -> Tokens:
     rng = np.random.default_rng(seed)
     columns, rows = np.meshgrid(np.arange(2, WIDE, 4), np.arange(2, HIGH, 4))
     x, y = (columns.reshape(-1) - WIDE / 2) / FOCAL * DEPTH, (rows.reshape(-1) - HIGH / 2) / FOCAL * DEPTH
-    means = (
-        np.stack([x, y, np.full(len(x), -DEPTH if behind else DEPTH)], axis=-1) + rng.normal(size=(len(x), 3)) * 0.01
-    )
+    z = np.full(len(x), -DEPTH if behind else DEPTH)
+    means = np.stack([x, y, z], axis=-1) + rng.normal(size=(len(x), 3)) * 0.01
     rgbs = np.repeat(wall_colors(means)[:, None], CONFIG.head.gaussians_per_token, axis=1)
-    rgbs = rgbs + 0.15 * rng.normal(size=rgbs.shape)
-    array = lambda value, *shape: np.broadcast_to(np.asarray(value, np.float32), (len(x), *shape))  # noqa: E731
-    arrays = dict(
-        means=array(means, 3),
-        feats=array(rng.normal(size=(len(x), 4)), 4),
-        confidences=array(0.9),
-        rgbs=array(rgbs.reshape(len(x), -1), rgbs[0].size),
-        quats=array([1.0, 0, 0, 0], 4),
-        footprints=array(4 * DEPTH / FOCAL),
-        valid=np.ones(len(x), bool),
-    )
-    return Tokens(**jax.device_put(arrays))
+    rgbs = jnp.asarray(rgbs + 0.15 * rng.normal(size=rgbs.shape), jnp.float32).reshape(len(x), -1)
+    feats, footprints = rng.normal(size=(len(x), 4)), jnp.full(len(x), 4 * DEPTH / FOCAL)
+    return tokens_at(means, 0.9, feats, rgbs=rgbs, footprints=footprints)
 
 
 FUSE = jax.jit(fuse, static_argnums=2)

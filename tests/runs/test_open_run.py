@@ -1,7 +1,6 @@
 """A run folder: damaged states, what identifies a run, and poses that are adjusted once, then used everywhere."""
 
 import contextlib
-import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from ssplat_jax.runs import open_run
 from ssplat_jax.storage.chunk_records import load_chunk_records, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
+from tests.data.capture_fixture import with_poses
 from tests.runs.report_fixture import record
 
 CAPTURE, SIZE = "procedural:room?frames=8", (64, 48)
@@ -87,13 +87,9 @@ def test_capacity_matters_only_if_tokens_may_be_dropped():
 
 def moved(capture, indices, advance=None):
     """An adjustment that moves every frame by the same shift."""
-    frames = list(capture.frames)
-    for i in indices:
-        pose = frames[i].camtoworld.copy()
-        pose[:3, 3] += SHIFT
-        frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
-    capture = dataclasses.replace(capture, frames=tuple(frames))
-    return adjusting.AdjustedPoses(capture, 0.5, 0.1, 0.4, 0.01, 500)
+    poses = capture.camtoworlds
+    poses[list(indices), :3, 3] += SHIFT
+    return adjusting.AdjustedPoses(with_poses(capture, poses), 0.5, 0.1, 0.4, 0.01, 500)
 
 
 @contextlib.contextmanager

@@ -4,8 +4,6 @@ The stream frame stands at the first camera: a capture and a copy with all poses
 chunks, which are all that a stream sees. What is decoded moves along: tests/data/test_stream_frame.py.
 """
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
@@ -13,6 +11,7 @@ import pytest
 from ssplat_jax.config import preset
 from ssplat_jax.data.open_capture import open_capture
 from tests.core.test_rotations import rodrigues
+from tests.data.capture_fixture import with_poses
 
 FLOAT32 = 2e-6  # of poses of a few stream units
 CONFIG = preset("tiny")
@@ -33,13 +32,9 @@ def capture():
 
 @pytest.mark.parametrize("name", MOTIONS)
 def test_a_moved_world_gives_the_same_chunks(capture, name):
-    scale, rotation, translation = MOTIONS[name]
-    frames = []
-    for posed in capture.frames:
-        pose = posed.camtoworld.copy()
-        pose[:3, :3], pose[:3, 3] = rotation @ pose[:3, :3], scale * rotation @ pose[:3, 3] + translation
-        frames.append(dataclasses.replace(posed, camtoworld=pose))
-    moved = dataclasses.replace(capture, frames=tuple(frames))
+    (scale, rotation, translation), poses = MOTIONS[name], capture.camtoworlds
+    poses[:, :3, :3], poses[:, :3, 3] = rotation @ poses[:, :3, :3], scale * poses[:, :3, 3] @ rotation.T + translation
+    moved = with_poses(capture, poses)
     here, there = (c.stream_frame(CONFIG) for c in (capture, moved))
     assert scale * there.scale == pytest.approx(here.scale, rel=1e-5)  # small parallax amplifies float64's rounding
     chunks = (c.chunks(CONFIG, range(4), stream_frame=frame) for c, frame in ((capture, here), (moved, there)))

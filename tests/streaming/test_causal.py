@@ -7,15 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.live_views import STEP, widen_range
 from ssplat_jax.streaming.session import Session, feed_chunks
+from tests.data.capture_fixture import with_poses
 from tests.model.small import random_params
 from tests.streaming.narrow_model import FEW_GAUSSIANS, assert_same_bits
 
@@ -40,14 +41,11 @@ def with_other_future(capture, first):
     rng = np.random.default_rng(1)
     images = np.stack([capture.image(i) for i in range(len(capture))])
     images[first:] = rng.uniform(size=images[first:].shape)
-    frames = list(capture.frames)
-    for i in range(first, len(frames)):
-        pose = np.eye(4)
-        pose[:3, :3] = np.asarray(quats_to_matrices(jnp.asarray(rng.normal(size=4), jnp.float32)), np.float64)
-        pose[:3, 3] = rng.normal(size=3) * 1e9
-        frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
-    depths = np.zeros(images.shape[:3], np.float32)
-    return dataclasses.replace(capture, frames=tuple(frames), pixels=ArrayPixels(images, depths))
+    poses, num = capture.camtoworlds, len(capture) - first
+    poses[first:, :3, :3] = Rotation.random(num, random_state=rng).as_matrix()
+    poses[first:, :3, 3] = rng.normal(size=(num, 3)) * 1e9
+    pixels = ArrayPixels(images, np.zeros(images.shape[:3], np.float32))
+    return dataclasses.replace(with_poses(capture, poses), pixels=pixels)
 
 
 def streamed(session, capture, num_chunks):

@@ -16,6 +16,7 @@ from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer import view_scene as browser_module
 from ssplat_jax.viewer.stage import Stage, draw, open_source, visible_splats
 from ssplat_jax.viewer.view_scene import Browser, Viewer
+from tests.rasterizer.scenes import balls
 from tests.viewer.fake_client import FakeClient, delta, frame, free_port, header
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
@@ -150,19 +151,9 @@ def test_a_picture_is_drawn_coarsely_then_finely_and_only_when_something_changes
     assert pictures[-1] is None and run.splats.visible and run.sent() == 6
 
 
-def walls(x, z, size, colors):
-    """Two flat Gaussians side by side."""
-    return ss.Gaussians.from_rgb(
-        means=jnp.array([[x[i], 0.0, z[i]] for i in range(2)], jnp.float32),
-        quats=jnp.array([[1.0, 0.0, 0.0, 0.0]] * 2),
-        scales=jnp.array([[size, size, 0.01]] * 2, jnp.float32),
-        opacities=jnp.full(2, 0.99),
-        colors=jnp.array(colors, jnp.float32),
-    )
-
-
 def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
-    viewed, at = walls([-0.6, 0.6], [2, 2.1], 0.6, [[0.9, 0.2, 0.1], [0.1, 0.3, 0.9]]), pose(0.1)
+    colors, at = [[0.9, 0.2, 0.1], [0.1, 0.3, 0.9]], pose(0.1)
+    viewed = balls([[-0.6, 0, 2], [0.6, 0, 2.1]], [0.6, 0.6, 0.01], 0.99, colors)  # flat, side by side
     viewmats, Ks = (jnp.asarray(x, jnp.float32) for x in (np.linalg.inv(at), K))
     view = Camera(viewmats=viewmats, Ks=Ks, width=48, height=32)
     out = ss.render(viewed, view)
@@ -179,7 +170,8 @@ def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
 
 
 def test_depth_is_light_near_and_dark_far():
-    depth = draw(walls([-0.5, 0.5], [2, 4], 0.25, [[0.5] * 3] * 2), "depth", pose(), K, SIZE).astype(float)
+    viewed = balls([[-0.5, 0, 2], [0.5, 0, 4]], [0.25, 0.25, 0.01], 0.99)
+    depth = draw(viewed, "depth", pose(), K, SIZE).astype(float)
     left, right = (slice(14, 18), slice(13, 17)), (slice(14, 18), slice(27, 30))
     assert depth[left].mean() > depth[right].mean() + 40 and (depth[:, 0] == 0).any()
 
