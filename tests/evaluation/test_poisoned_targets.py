@@ -24,11 +24,6 @@ def capture(programs_shared):
     return open_capture("procedural:room?frames=9&size=64x48")
 
 
-@pytest.fixture(scope="module")
-def params():
-    return random_params(FEW_GAUSSIANS)
-
-
 def poisoned(capture, frames, below):
     """The capture with frames that are noise above and `below` in their lower half."""
     images, frames = np.stack([capture.image(i) for i in range(len(capture))]), list(frames)
@@ -38,7 +33,7 @@ def poisoned(capture, frames, below):
     return dataclasses.replace(capture, pixels=ArrayPixels(images.astype(np.float32), depths))
 
 
-def evaluated(capture, params, causal, out, monkeypatch):
+def evaluated(capture, causal, out, monkeypatch):
     """Everything that an evaluation makes besides scores: frame, exposures, cache, scene and rendered pictures."""
     rendered = []
 
@@ -54,24 +49,24 @@ def evaluated(capture, params, causal, out, monkeypatch):
     monkeypatch.setattr(evaluation, "baselines", lambda capture, split: {})
     monkeypatch.setattr(evaluation, "peak_memory", lambda *given: {"peak_memory_bytes": None})
     monkeypatch.setattr(cost, "NUM_REPEATS", 1)
-    session = Session(StreamSplat(FEW_GAUSSIANS.replace(causal=causal)), params)
+    session = Session(StreamSplat(FEW_GAUSSIANS.replace(causal=causal)), random_params(FEW_GAUSSIANS))
     metrics = evaluation.evaluate(session, capture, SPLIT, out)
     facts = {name: metrics[name] for name in ("stream_frame", "exposures", "cache", "num_gaussians", "split_sha256")}
     return facts, (session.cache, session.gaussians(), rendered)
 
 
 @pytest.mark.parametrize("causal", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_poisoned_targets_change_nothing_but_scores(causal, capture, params, tmp_path, monkeypatch):
-    facts, arrays = evaluated(capture, params, causal, tmp_path / "clean", monkeypatch)
+def test_poisoned_targets_change_nothing_but_scores(causal, capture, tmp_path, monkeypatch):
+    facts, arrays = evaluated(capture, causal, tmp_path / "clean", monkeypatch)
     other = poisoned(capture, SPLIT.targets, np.nan)
-    got, there = evaluated(other, params, causal, tmp_path / "poisoned", monkeypatch)
+    got, there = evaluated(other, causal, tmp_path / "poisoned", monkeypatch)
     assert got == facts
     assert_same_bits(there, arrays)
 
 
 @pytest.mark.slow
-def test_a_poisoned_context_view_is_noticed(capture, params, tmp_path, monkeypatch):
+def test_a_poisoned_context_view_is_noticed(capture, tmp_path, monkeypatch):
     """The comparison above can fail."""
-    facts, _ = evaluated(capture, params, False, tmp_path / "clean", monkeypatch)
+    facts, _ = evaluated(capture, False, tmp_path / "clean", monkeypatch)
     other = poisoned(capture, SPLIT.context[-1:], 0.5)
-    assert evaluated(other, params, False, tmp_path / "noise", monkeypatch)[0] != facts
+    assert evaluated(other, False, tmp_path / "noise", monkeypatch)[0] != facts

@@ -17,23 +17,18 @@ ROOM = "procedural:room?frames=8&size=32x24"
 QUIET = Reporter(quiet=True)
 
 
-@pytest.fixture
-def renders(tmp_path):
-    """The targets of a split, 1/10 darker than they are."""
-    room, split = open_capture(ROOM), interleaved_split(8, 1, 5)
-    folder = tmp_path / "theirs"
-    folder.mkdir()
+def write_renders(folder, room, split, gain=1.0):
+    """The targets of a split, darker than they are by a gain."""
+    folder.mkdir(parents=True)
     (folder / "split.json").write_text(split.to_json())
     for i in split.targets:
-        Image.fromarray((np.clip(room.image(i) * 0.9, 0, 1) * 255).round().astype(np.uint8)).save(
-            folder / f"{i:05d}.png"
-        )
-    return folder, room, split
+        Image.fromarray((room.image(i) * gain * 255).round().astype(np.uint8)).save(folder / f"{i:05d}.png")
 
 
-def test_renders_are_scored_as_they_are(renders, tmp_path):
-    folder, room, split = renders
-    run(Path(ROOM), tmp_path / "out", "smoke", QUIET, renders=folder)
+def test_renders_are_scored_as_they_are(tmp_path):
+    room, split = open_capture(ROOM), interleaved_split(8, 1, 5)
+    write_renders(tmp_path / "theirs", room, split, 0.9)
+    run(Path(ROOM), tmp_path / "out", "smoke", QUIET, renders=tmp_path / "theirs")
     theirs, copy, flat = json.loads((tmp_path / "out" / "table.json").read_text())
     errors = [np.mean((0.1 * room.image(i).astype(np.float64)) ** 2) for i in split.targets]
     assert abs(theirs["literal_psnr"] - np.mean(-10 * np.log10(errors))) < 0.02
@@ -46,10 +41,7 @@ def test_scores_are_means_over_views_then_scenes_and_memory_is_the_largest(tmp_p
     capture, theirs = open_capture(ROOM), tmp_path / "theirs"
     for scene, split in (("a", interleaved_split(8, 1, 5)), ("b", Split("index", (0, 2, 5), (1, 3)))):
         make_capture(tmp_path / "scenes" / scene, num_frames=8, size=(32, 24))
-        (theirs / scene).mkdir(parents=True)
-        (theirs / scene / "split.json").write_text(split.to_json())
-        for i in split.targets:
-            Image.fromarray((capture.image(i) * 255).astype(np.uint8)).save(theirs / scene / f"{i:05d}.png")
+        write_renders(theirs / scene, capture, split)
         (theirs / scene / "metrics.json").write_text(json.dumps({"peak_memory_bytes": 100 + len(split.targets)}))
     run(tmp_path / "scenes", tmp_path / "out", "smoke", QUIET, renders=theirs)
     rows = json.loads((tmp_path / "out" / "table.json").read_text())

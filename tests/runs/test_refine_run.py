@@ -1,6 +1,5 @@
 """Refinement of a finished run: it continues after a stop, and never loses the scene that it started from."""
 
-import functools
 import json
 import signal
 
@@ -23,18 +22,13 @@ CAPTURE, QUIET = "procedural:room?frames=4&size=64x48", Reporter(quiet=True)
 
 def refine(path, steps=4, overwrite=False):
     options = Refine(path, CAPTURE, steps=steps, save_every=2, overwrite=overwrite)
-    return refine_run(params(), options, QUIET)
+    return refine_run(random_params(FEW_GAUSSIANS), options, QUIET)
 
 
 def stream(out, overwrite=False):
     """Streams small frames into `out`."""
     options = Run(CAPTURE, out, save_every=1, overwrite=overwrite)
-    return run_capture(StreamSplat(FEW_GAUSSIANS), params(), options, QUIET)
-
-
-@functools.cache
-def params():
-    return random_params(FEW_GAUSSIANS)
+    return run_capture(StreamSplat(FEW_GAUSSIANS), random_params(FEW_GAUSSIANS), options, QUIET)
 
 
 @pytest.fixture(scope="module")

@@ -21,35 +21,26 @@ from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 
 
-@pytest.fixture(scope="module")
-def params():
-    return random_params(NARROW)
-
-
-@pytest.fixture
-def saved(params, tmp_path):
-    save_weights(tmp_path / "weights.npz", params, NARROW, {"steps": 3})
-    return tmp_path / "weights.npz"
-
-
-def test_weights_are_read_back_as_rounded_to_float16(params, saved):
-    loaded, config = load_weights(saved)
+def test_weights_are_read_back_as_rounded_to_float16(tmp_path):
+    save_weights(tmp_path / "w.npz", random_params(NARROW), NARROW, {"steps": 3})
+    loaded, config = load_weights(tmp_path / "w.npz")
     assert config == NARROW
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, np.asarray(b, np.float16)), loaded, params)
+    wanted = jax.tree.map(lambda x: np.asarray(x, np.float16), random_params(NARROW))
+    jax.tree.map(np.testing.assert_array_equal, loaded, wanted)
     assert {str(x.dtype) for x in jax.tree.leaves(loaded)} == {"float32"}
 
 
-def test_weights_of_another_width_are_refused_by_name(params, tmp_path):
-    save_weights(tmp_path / "w.npz", params, NARROW.replace(token_width=NARROW.network.token_width * 2), {})
+def test_weights_of_another_width_are_refused_by_name(tmp_path):
+    save_weights(tmp_path / "w.npz", random_params(NARROW), NARROW.replace(token_width=32), {})
     with pytest.raises(InputError, match="must be"):
         load_params(str(tmp_path / "w.npz"))
 
 
-def test_weights_may_have_stages_that_are_switched_off(params):
+def test_weights_may_have_stages_that_are_switched_off():
     """`--set mixer_blocks=0` switches a stage off; missing stages are still refused."""
-    check_params(params, NARROW.replace(mixer_blocks=0), "here")
+    check_params(random_params(NARROW), NARROW.replace(mixer_blocks=0), "here")
     with pytest.raises(InputError, match=r"here.*mixer"):
-        check_params(params, NARROW.replace(mixer_blocks=NARROW.network.mixer_blocks + 1), "here")
+        check_params(random_params(NARROW), NARROW.replace(mixer_blocks=NARROW.network.mixer_blocks + 1), "here")
 
 
 def test_training_changes_a_stage_and_decay_does_not():

@@ -7,23 +7,14 @@ import pytest
 
 from ssplat_jax.cache.state import grow, init_cache
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.compact import GaussianHead
-from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
 from tests.cache.streams import CAPACITY, CONFIG, PLACES, VARIANTS, Recipe, fuse, to_jax, written_rows
+from tests.model.small import random_params
 
 HEAD_TOL = 1e-5  # relative and absolute: programs for different numbers of rows may round differently
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
-
-
-def decoder_params(config):
-    head = GaussianHead(config).init(jax.random.key(0), jnp.zeros((1, config.network.token_width)))["params"]
-    kernel = jax.random.normal(jax.random.key(1), head["out"]["kernel"].shape)
-    evidence = init_params(jax.random.key(2), config, only=("evidence",))["evidence"]
-    evidence = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.key(3), x.shape), evidence)
-    return {"decoder": head | {"out": head["out"] | {"kernel": kernel}}, "evidence": evidence}
 
 
 def chunk(seed):
@@ -44,17 +35,15 @@ def carved(cache, rng, config):
 def assert_same_scene(received, scene):
     shown = np.asarray(scene.opacities) > 0
     np.testing.assert_array_equal(received.opacities > 0, shown)
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        np.testing.assert_allclose(
-            getattr(received, name)[shown], np.asarray(getattr(scene, name))[shown], rtol=HEAD_TOL, atol=HEAD_TOL
-        )
+    parts = (jax.tree.map(lambda x: np.asarray(x)[shown], gaussians) for gaussians in (received, scene))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=HEAD_TOL, atol=HEAD_TOL), *parts)
 
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_deltas_put_together_equal_the_scene(name):
     """Over a stream whose cache grows, with deltas that span several chunks."""
     config = VARIANTS[name]
-    model, params, rng = StreamSplat(config), decoder_params(config), np.random.default_rng(0)
+    model, params, rng = StreamSplat(config), random_params(config), np.random.default_rng(0)
     cache, feed, decode = init_cache(config, CAPACITY), SceneFeed(model, params), jax.jit(model.decode)
     received = None
     for seed in range(6):
@@ -71,7 +60,7 @@ def test_deltas_put_together_equal_the_scene(name):
 def test_a_delta_holds_the_changed_rows_alone(monkeypatch):
     """The time of the last write alone tells which, since the cache has no evidence."""
     config = CONFIG.replace(evidence=False)
-    model, params = StreamSplat(config), decoder_params(CONFIG)
+    model, params = StreamSplat(config), random_params(config)
     feed, cache = SceneFeed(model, params), init_cache(config, CAPACITY)
     assert len(feed.update(cache).rows) == 0
     cache = fuse(cache, chunk(1), config)

@@ -29,7 +29,6 @@ from tests.cache.test_votes import after_chunk, seen
 from tests.model.small import random_params
 from tests.rasterizer.scenes import cloud
 from tests.streaming.narrow_model import NARROW
-from tests.streaming.test_scene_delta import decoder_params
 from tests.training.problems import NARROW_DEPTH, STREAM_PHASE
 
 WIDTH = losses.DepthLoss.target_width
@@ -216,7 +215,7 @@ def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
     cache = after_chunk(init_cache(config, streams.CAPACITY), front_camera(), seen(2.0))
     tokens = streams.tokens_at([[0, 0, 1.0], [0, 0, 2.0], [0, 0, 3.0], [0, 0, 2.0]], jnp.array([0.6, 0.6, 0.6, 0.2]))
     accepted = jax.jit(functools.partial(losses.decode_accepted, StreamSplat(config)))
-    shown = np.asarray(accepted(decoder_params(config), cache, tokens).opacities > 0).reshape(4, -1)
+    shown = np.asarray(accepted(random_params(config), cache, tokens).opacities > 0).reshape(4, -1)
     np.testing.assert_array_equal(shown, np.broadcast_to([[False], [True], [True], [False]], shown.shape))
 
 

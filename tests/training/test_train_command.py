@@ -59,14 +59,19 @@ def trained(tmp_path_factory):
     return out, streams
 
 
-def test_the_evidence_head_learns_alone(trained):
-    (before, _), (after, config) = (load_weights(trained[0] / name) for name in ("narrow.npz", "weights.npz"))
+def assert_learned_alone(folder, stage, least):
+    """The weights in a folder differ from those of the start in a stage alone, whose last layer began with zeros."""
+    (before, _), (after, config) = (load_weights(folder / name) for name in ("narrow.npz", "weights.npz"))
     assert config == SMALL
-    for stage in before:
-        same = [np.array_equal(a, b) for a, b in zip(flat(before[stage]), flat(after[stage]), strict=True)]
-        assert all(same) == (stage != "evidence")
+    for name in before:
+        same = [np.array_equal(a, b) for a, b in zip(flat(before[name]), flat(after[name]), strict=True)]
+        assert all(same) == (name != stage)
     assert all(np.isfinite(x).all() for x in flat(after))
-    assert np.abs(after["evidence"]["out"]["kernel"]).max() > 1e-3  # zeros before training
+    assert np.abs(after[stage]["out"]["kernel"]).max() > least
+
+
+def test_the_evidence_head_learns_alone(trained):
+    assert_learned_alone(trained[0], "evidence", 1e-3)
 
 
 def test_a_crop_shows_what_the_whole_scene_shows_there(trained):
@@ -82,9 +87,8 @@ def test_a_crop_shows_what_the_whole_scene_shows_there(trained):
     for camera, count in zip(seen_from, counts, strict=True):
         pivots = crops.pivots_in_sight(cache, camera, SMALL, num_pivots)
         assert (pivots >= 0).sum() == count[0]
-        wanted, got = (
-            render(x, camera, effects=crops.EFFECTS, max_pairs=1 << 15) for x in (everything, decode(pivots))
-        )
+        scenes = everything, decode(pivots)
+        wanted, got = (render(x, camera, effects=crops.EFFECTS, max_pairs=1 << 15) for x in scenes)
         assert int(wanted.num_overflow) == 0
         np.testing.assert_allclose(got.color, wanted.color, atol=1e-6)
         num_left_out += int((everything.opacities > 0).sum()) - count[1]
@@ -102,27 +106,15 @@ def test_half_of_the_views_of_a_crop_were_never_streamed(trained):
     assert np.isfinite(views.exposures).all() and (views.exposures > 0).all()
 
 
-@pytest.fixture(scope="module")
-def anchored(tmp_path_factory):
-    """Folder of a command that trained the learned anchor on two short streams."""
-    out, (phase,) = tmp_path_factory.mktemp("anchor"), ANCHOR_RECIPE.phases
-    with pytest.MonkeyPatch.context() as patch:
-        draw_with_numpy(patch, compiled=("hpda",))
-        phase = dataclasses.replace(phase, steps=6, samples=PARTS, warmup_steps=1)
-        patch.setitem(recipe.RECIPES, "anchor", dataclasses.replace(ANCHOR_RECIPE, phases=(phase,)))
-        save_weights(out / "narrow.npz", random_params(SMALL), SMALL, {})
-        assert Train(out=out, recipe="anchor", init_weights=out / "narrow.npz", quiet=True).run() == 0
-    return out
-
-
-def test_the_anchor_learns_alone(anchored):
-    (before, _), (after, config) = (load_weights(anchored / name) for name in ("narrow.npz", "weights.npz"))
-    assert config == SMALL
-    for stage in before:
-        same = [np.array_equal(a, b) for a, b in zip(flat(before[stage]), flat(after[stage]), strict=True)]
-        assert all(same) == (stage != "hpda")
-    assert np.abs(after["hpda"]["out"]["kernel"]).max() > 0  # zeros before training
-    (record,) = (json.loads(line) for line in (anchored / "log.jsonl").read_text().splitlines())
+def test_the_anchor_learns_alone(tmp_path, monkeypatch):
+    """On two short streams."""
+    draw_with_numpy(monkeypatch, compiled=("hpda",))
+    phase = dataclasses.replace(ANCHOR_RECIPE.phases[0], steps=6, samples=PARTS, warmup_steps=1)
+    monkeypatch.setitem(recipe.RECIPES, "anchor", dataclasses.replace(ANCHOR_RECIPE, phases=(phase,)))
+    save_weights(tmp_path / "narrow.npz", random_params(SMALL), SMALL, {})
+    assert Train(out=tmp_path, recipe="anchor", init_weights=tmp_path / "narrow.npz", quiet=True).run() == 0
+    assert_learned_alone(tmp_path, "hpda", 0)
+    (record,) = (json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines())
     assert np.isfinite(list(record[name] for name in ("l1", "l1_of_matcher", "entropy"))).all()
 
 
@@ -201,6 +193,5 @@ def test_the_head_that_the_weights_have_does_not_matter(tmp_path, started):
     noise = jax.tree.map(lambda x: np.asarray(x) + 1, load_params("tiny"))
     save_weights(tmp_path / "w.npz", noise, preset("tiny"), {})
     Train(out=tmp_path, recipe="evidence", init_weights=tmp_path / "w.npz", seed=5).run()
-    assert_same_bits(
-        started["params"]["evidence"], init_params(jax.random.key(5), preset("tiny"), ["evidence"])["evidence"]
-    )
+    wanted = init_params(jax.random.key(5), preset("tiny"), ["evidence"])
+    assert_same_bits(started["params"]["evidence"], wanted["evidence"])
