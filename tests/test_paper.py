@@ -238,9 +238,8 @@ def test_inference_decodes_the_fused_token_by_the_head_alone():
     colors = raw[:, 10:].reshape(-1, 3, 16).swapaxes(1, 2)
     colors[:, 0] += (f64(cache.rgbs).reshape(-1, 3)[alive] - 0.5) / 0.28209479177387814
     np.testing.assert_allclose(got.sh, colors, atol=1e-4)
-    cameras, heads = (
-        quats_to_matrices(f32(q)) for q in (f64(cache.quats).reshape(-1, 4)[alive], np.roll(raw[:, :4], 1, axis=1))
-    )
+    quats = cache.quats.reshape(-1, 4)[alive], np.roll(raw[:, :4], 1, axis=1)
+    cameras, heads = (quats_to_matrices(f32(q)) for q in quats)
     np.testing.assert_allclose(quats_to_matrices(f32(got.quats)), np.matmul(cameras, heads), atol=1e-4)
 
 

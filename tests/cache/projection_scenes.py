@@ -27,13 +27,9 @@ def cameras(seed: int, num_views: int = 2) -> Camera:
         q, _ = np.linalg.qr(np.eye(3) + 0.2 * rng.normal(size=(3, 3)))
         viewmat[:3, :3] = q * np.sign(np.diagonal(q))
         viewmat[:3, 3] = rng.uniform(-0.3, 0.3, 3) + np.array([0, 0, 4])
-    Ks = np.tile([[9.0, 0, 4.3], [0, 8.0, 2.8], [0, 0, 1]], (num_views, 1, 1)) * rng.uniform(
-        0.9, 1.1, (num_views, 1, 1)
-    )
-    Ks[:, 2, 2] = 1
-    return Camera(
-        viewmats=jnp.asarray(viewmats, jnp.float32), Ks=jnp.asarray(Ks, jnp.float32), width=GRID_WIDTH, height=HEIGHT
-    )
+    Ks = np.tile([[9.0, 0, 4.3], [0, 8.0, 2.8], [0, 0, 1]], (num_views, 1, 1))
+    Ks[:, :2] *= rng.uniform(0.9, 1.1, (num_views, 1, 1))
+    return Camera(jnp.asarray(viewmats, jnp.float32), jnp.asarray(Ks, jnp.float32), width=GRID_WIDTH, height=HEIGHT)
 
 
 def scene(seed: int, num_voxels: int, depth_spread: float) -> VoxelCache:

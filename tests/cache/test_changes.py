@@ -17,13 +17,11 @@ SIZE = CONFIG.memory.voxel_size
 PER_TOKEN = CONFIG.head.gaussians_per_token
 REFINED = CONFIG.replace(steps_per_chunk=1)
 FOOTPRINT = 1.5 * SIZE
+_SETTLE, _VOXELS = jax.jit(settle, static_argnums=3), jax.jit(voxel_indices, static_argnums=2)
 
 
 def settled(means, change):
     return _SETTLE(means, jnp.full(len(means), FOOTPRINT), change, CONFIG)
-
-
-_SETTLE = jax.jit(settle, static_argnums=3)
 
 
 def pivots(seed: int, span: float, count: int = 256) -> jax.Array:
@@ -37,9 +35,6 @@ def pivots(seed: int, span: float, count: int = 256) -> jax.Array:
 def changes(seed: int, scale: float, count: int = 256) -> Change:
     packed = np.random.default_rng(seed).normal(size=(count, PER_TOKEN * WIDTH)) * scale
     return unpack(jnp.asarray(packed, jnp.float32))
-
-
-_VOXELS = jax.jit(voxel_indices, static_argnums=2)
 
 
 def cells(means) -> np.ndarray:

@@ -153,9 +153,7 @@ def test_merged_means_stay_between_their_members():
     cache, rng = init_cache(streams.CONFIG, streams.CAPACITY), np.random.default_rng(0)
     for _ in range(20):
         confidences = rng.uniform(0.3, 1.0, streams.NUM_TOKENS)
-        tokens = one_voxel(
-            rng.normal(size=(streams.NUM_TOKENS, 4)), confidences, np.full((streams.NUM_TOKENS, 3), edge)
-        )
-        cache = streams.fuse(cache, tokens, streams.CONFIG)
+        feats, means = rng.normal(size=(streams.NUM_TOKENS, 4)), np.full((streams.NUM_TOKENS, 3), edge)
+        cache = streams.fuse(cache, one_voxel(feats, confidences, means), streams.CONFIG)
     np.testing.assert_array_equal(np.asarray(cache.means)[0], edge)
     assert int(cache.num_voxels) == 1 and int(cache.stats.num_merged) > 900

@@ -30,8 +30,6 @@ for words in ((), *((name,) for name in COMMANDS)):
         assert not stop.code
 assert "jax" not in sys.modules, "help imported jax"
 """
-
-
 ROOM = "procedural:room?frames=12&size=32x24"
 
 
@@ -42,8 +40,7 @@ def test_help_does_not_import_jax_and_shows_examples():
 
 
 def test_output_that_nobody_reads_ends_a_command_quietly():
-    code = "from ssplat_jax.commands.start import start; start()"
-    command = [sys.executable, "-c", code, "--help"]
+    command = [sys.executable, "-m", "ssplat_jax.commands.start", "--help"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stderr is not None
         process.stdout.close()
@@ -135,9 +132,8 @@ def test_two_values_of_one_field_are_refused():
 @pytest.mark.slow  # compiles a network of 62 million parameters
 @pytest.mark.parametrize("name", ["small", "paper"])
 def test_imported_weights_stream_a_capture(name, tmp_path, capsys):
-    tensors = {
-        t.name: named_tensor(t.name, t.shape) for t in published_tensors(preset("small")).values() if t is not None
-    }
+    published = [t for t in published_tensors(preset("small")).values() if t is not None]
+    tensors = {t.name: named_tensor(t.name, t.shape) for t in published}
     np.savez(tmp_path / "upstream.npz", **tensors)
     checkpoint, file = tmp_path / "upstream.npz", tmp_path / f"{name}.npz"
     assert run("import-weights", checkpoint, "--preset", name, "--out", file) == 0
@@ -182,8 +178,8 @@ def test_an_output_that_is_closed_changes_nothing(tmp_path):
 
 
 def test_python_without_docstrings_is_refused_in_a_line():
-    code = "from ssplat_jax.commands.start import start; start()"
-    done = subprocess.run([sys.executable, "-OO", "-c", code, "--help"], capture_output=True, text=True)
+    command = [sys.executable, "-OO", "-m", "ssplat_jax.commands.start", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and "got -OO" in done.stderr and done.stderr.count("\n") == 1
 
 

@@ -70,10 +70,8 @@ def test_an_evaluation_refines_at_the_streamed_size_and_scores_at_the_captures(t
     metrics = read(out / "metrics.json")
     assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
-    decoded = metrics["cache"]["decoded"]
-    assert (
-        FEW_GAUSSIANS.head.gaussians_per_token * metrics["cache"]["pivots"] >= decoded >= metrics["num_gaussians"] > 0
-    )
+    most, decoded = FEW_GAUSSIANS.head.gaussians_per_token * metrics["cache"]["pivots"], metrics["cache"]["decoded"]
+    assert most >= decoded >= metrics["num_gaussians"] > 0
     assert hashlib.sha256((out / "split.json").read_bytes()).hexdigest() == metrics["split_sha256"]
     # Streamed at half the size, scored at the whole.
     assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])

@@ -84,10 +84,8 @@ def command():
 def ended(command: str, patience: float = 60.0, run: str = "exit(main.guarded(command))") -> tuple[int, str]:
     """Exit code and last words of a process that interrupts itself."""
     environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false", "XLA_FLAGS": ""}
-    code = AROUND.format(command=command, patience=patience, run=run)
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=TIMEOUT
-    )
+    started = [sys.executable, "-c", AROUND.format(command=command, patience=patience, run=run)]
+    done = subprocess.run(started, capture_output=True, text=True, env=environment, timeout=TIMEOUT)
     return done.returncode, done.stderr
 
 

@@ -25,7 +25,7 @@ from ssplat_jax.storage.saved_states import load_state
 from ssplat_jax.storage.weights import load_weights
 from ssplat_jax.streaming.scene_delta import apply_delta
 from tests.commands.command_fixture import SIZE, edit, make_capture, read, run
-from tests.runs.report_fixture import record
+from tests.runs.test_run_results import record
 
 
 @pytest.fixture(scope="module")

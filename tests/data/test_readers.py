@@ -27,9 +27,6 @@ from tests.data.capture_writers import (
     write_colmap_text,
     write_depth,
     write_image,
-    write_llff,
-    write_record3d,
-    write_tum,
 )
 
 NAMES = {  # in the order of streaming
@@ -54,7 +51,7 @@ WITH_DEPTH = ("ScanNet", "TUM RGB-D", "Polycam")
 
 
 def test_llff_images_have_the_poses_of_their_names_and_not_of_what_they_link_to(tmp_path):
-    write_llff(tmp_path)
+    WRITERS["LLFF"](tmp_path)
     (tmp_path / "raw").mkdir()
     for i in range(NUM_FRAMES):
         image = tmp_path / "images" / f"IMG_{i}.JPG"
@@ -133,7 +130,7 @@ def test_colmap_camera_models_give_their_intrinsics(model, name, params, coeffic
 
 def test_tum_poses_are_interpolated_in_time(tmp_path):
     """On a screw motion, interpolated poses agree with the motion at all times."""
-    write_tum(tmp_path)
+    WRITERS["TUM RGB-D"](tmp_path)
     start, spin, speed = 1305031102.2, np.array([0.3, -0.8, 0.5]), np.array([0.4, 0.1, -0.2])  # rad/s, m/s
 
     def pose(time):
@@ -155,7 +152,7 @@ def test_tum_poses_are_interpolated_in_time(tmp_path):
 
 
 def test_tum_depth_maps_are_those_nearest_in_time(tmp_path):
-    write_tum(tmp_path)
+    WRITERS["TUM RGB-D"](tmp_path)
     lines = (tmp_path / "depth.txt").read_text().splitlines()
     before = [f"{float(line.split()[0]) - 0.013:.6f} depth/before{i}.png" for i, line in enumerate(lines)]
     after = [f"{float(line.split()[0]) + 0.004:.6f} depth/after{i}.png" for i, line in enumerate(lines)]
@@ -168,7 +165,7 @@ def test_tum_depth_maps_are_those_nearest_in_time(tmp_path):
 
 
 def test_record3d_images_may_have_intrinsics_of_their_own(tmp_path):
-    write_record3d(tmp_path)
+    WRITERS["Record3D"](tmp_path)
     file = tmp_path / "metadata.json"
     meta = json.loads(file.read_text())
     rows = [[FX + i, FY - i, CX + 0.5 * i, CY - 0.25 * i] for i in range(NUM_FRAMES)]

@@ -3,17 +3,41 @@
 import re
 import shlex
 import subprocess
+from pathlib import Path
 
 import pytest
 
 from ssplat_jax.commands import main as command_line
-from tests.docs.pages import INLINE_CODE, LINK, PAGES, ROOT, anchors, blocks, page_name, prose
 
-every_page = pytest.mark.parametrize("page", PAGES, ids=page_name)
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*(ROOT / "docs").glob("*.md"), *ROOT.glob("*.md")])
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+INLINE_CODE = re.compile(r"`([^`]+)`")
+
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 
 STREAMED = "procedural:room"
 STREAMED_SMALL = "procedural:room?frames=8&size=64x48"
 """The capture of the manual loop, and a small one in its place."""
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Contents of the fenced blocks in a language."""
+    return [text for found, text in FENCE.findall(page.read_text()) if found == language]
+
+
+def prose(page: Path) -> str:
+    """The page without its fenced blocks."""
+    return FENCE.sub("", page.read_text())
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings, as Python-Markdown's `toc` makes them."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    plain = (re.sub(r"[^\w\s-]", "", heading).strip().lower() for heading in headings)
+    return {re.sub(r"[-\s]+", "-", heading) for heading in plain}
 
 
 def commands_of(page) -> list[str]:

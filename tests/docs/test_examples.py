@@ -11,7 +11,7 @@ from PIL import Image
 import ssplat_jax as ss
 from ssplat_jax.data import open_capture as captures
 from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Reader
-from tests.docs.pages import ROOT
+from tests.docs.test_docs import ROOT
 from tests.model.small import random_params
 from tests.streaming.narrow_model import FEW_GAUSSIANS
 

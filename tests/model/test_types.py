@@ -30,8 +30,6 @@ from ssplat_jax.model.views import (
 from tests.model.small import CONFIG, HEIGHT, MODEL, WIDTH, chunk, params, random_params
 
 FLOAT32 = 1e-5
-
-
 prepared = jax.jit(lambda chunk: prepare_views(chunk, CONFIG))
 BACK_PROJECT, SOURCES = jax.jit(back_project), jax.jit(nearest_sources, static_argnums=2)
 

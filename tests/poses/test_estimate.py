@@ -82,9 +82,8 @@ def test_a_stopped_call_continues(photos, estimated, tmp_path, monkeypatch):
         kept = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
     assert len(kept) == NUM_PHOTOS and min(kept.values()) > 50
     assert estimate(photos, out).registered == estimated[1].registered
-    np.testing.assert_allclose(
-        open_capture(out).camtoworlds[:, :3, :3], open_capture(estimated[0]).camtoworlds[:, :3, :3], atol=0.02
-    )
+    found, wanted = (open_capture(folder).camtoworlds[:, :3, :3] for folder in (out, estimated[0]))
+    np.testing.assert_allclose(found, wanted, atol=0.02)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -16,9 +16,7 @@ from tests.rasterizer.scenes import balls
 WIDTH, HEIGHT, TILE = 28, 20, 8  # no multiple of a tile
 GRID = Grid(num_images=1, height=HEIGHT, width=WIDTH, tile=TILE)
 NUM_ROWS, MAX_PAIRS = 20_000, 180_000
-CAMERA = Camera(
-    viewmats=jnp.eye(4)[None], Ks=jnp.array([[[30.0, 0, 13.0], [0, 28.0, 11.0], [0, 0, 1]]]), width=WIDTH, height=HEIGHT
-)
+CAMERA = Camera(jnp.eye(4)[None], jnp.array([[[30.0, 0, 13], [0, 28, 11], [0, 0, 1]]]), width=WIDTH, height=HEIGHT)
 
 
 def random_gaussians(seed: int) -> Gaussians:

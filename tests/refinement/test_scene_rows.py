@@ -21,8 +21,6 @@ from ssplat_jax.refinement.refine_step import may_be_seen, round_rows, without_p
 from tests.refinement.test_refine import CONFIG, MAX_PAIRS, NUM, cameras, doubtful, key_views, step
 
 module = importlib.import_module("ssplat_jax.refinement.refine_step")  # the package has a function of that name
-
-
 SEEN = jax.jit(may_be_seen)
 
 

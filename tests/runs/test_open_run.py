@@ -19,7 +19,7 @@ from ssplat_jax.storage.chunk_records import load_chunk_records, save_chunk_reco
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
 from tests.data.capture_fixture import with_poses
-from tests.runs.report_fixture import record
+from tests.runs.test_run_results import record
 
 CAPTURE, SIZE = "procedural:room?frames=8", (64, 48)
 QUIET = Reporter(quiet=True)
@@ -33,9 +33,8 @@ def capture():
 
 
 def opened(capture, out, reporter=QUIET, **options):
-    return open_run.open_run(
-        StreamSplat(CONFIG), load_params("tiny"), capture, range(8), out, reporter=reporter, **options
-    )
+    model = StreamSplat(CONFIG)
+    return open_run.open_run(model, load_params("tiny"), capture, range(8), out, reporter=reporter, **options)
 
 
 def save_views(run, count):

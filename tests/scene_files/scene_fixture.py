@@ -51,7 +51,6 @@ def compressed_ply(degree: int = 1, n: int = 300) -> bytes:
     return "\n".join([*header, "end_header\n"]).encode() + b"".join(parts)
 
 
-def camera(x: float = 0.0) -> Camera:
-    """Camera near the origin that looks along +z."""
-    viewmat = jnp.eye(4).at[0, 3].set(x)
-    return Camera(viewmats=viewmat, Ks=jnp.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), width=48, height=32)
+def camera() -> Camera:
+    """Camera at the origin that looks along +z."""
+    return Camera(viewmats=jnp.eye(4), Ks=jnp.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), width=48, height=32)

@@ -36,9 +36,8 @@ class Glb:
 
     def with_attribute(self, name, values, component, view=None, **accessor):
         """Points an attribute at `values`, which are appended to the buffer."""
-        self.document["bufferViews"].append(
-            {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": values.nbytes} | (view or {})
-        )
+        place = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": values.nbytes}
+        self.document["bufferViews"].append(place | (view or {}))
         self.buffer += values.tobytes()
         kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[-1]]
         place = len(self.document["bufferViews"]) - 1

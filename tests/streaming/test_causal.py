@@ -115,9 +115,7 @@ def test_pushed_masks_give_what_a_masked_capture_gives(capture, programs_shared,
     params = random_params(model.config)
     masks = np.ones((NUM_FRAMES, 48, 64), bool)
     masks[5:7, 8:24, 12:36] = False
-    frames = tuple(
-        dataclasses.replace(f, is_masked=not mask.all()) for f, mask in zip(capture.frames, masks, strict=True)
-    )
+    frames = tuple(dataclasses.replace(f, is_masked=i in (5, 6)) for i, f in enumerate(capture.frames))
     masked = dataclasses.replace(capture, frames=frames, pixels=dataclasses.replace(capture.pixels, masks=masks))
     driver, live = (Session(model, params, refine=online_refinement(model)) for _ in range(2))
     list(feed_chunks(driver, masked, range(8), masked.stream_frame(model.config)))

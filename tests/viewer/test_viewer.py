@@ -1,5 +1,6 @@
 """Scenes and pictures that browsers are sent, their sources, and the server."""
 
+import functools
 import json
 import sys
 import urllib.request
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
 from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, load_delta, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
@@ -37,9 +39,7 @@ def test_splats_equal_the_gaussians_in_16_bits_at_any_size(size):
     sent = splats["covariances"].astype(np.float16).astype(np.float64) * unit**2
     np.testing.assert_allclose(sent / largest, wanted / largest, atol=2 * HALF_PRECISION)
     np.testing.assert_allclose(splats["centers"] * unit, gaussians.means, rtol=1e-5, atol=1e-6 * size)
-    np.testing.assert_allclose(
-        splats["rgbs"], np.clip(0.5 + 0.28209479 * np.asarray(gaussians.sh[:, 0]), 0, 1), atol=1e-6
-    )
+    np.testing.assert_allclose(splats["rgbs"], np.clip(0.5 + SH_C0 * gaussians.sh[:, 0], 0, 1), atol=1e-6)
     np.testing.assert_array_equal(splats["opacities"][:, 0], gaussians.opacities)
 
 
@@ -48,9 +48,8 @@ def test_invisible_gaussians_are_dropped_and_huge_ones_cut():
     means = gaussians.means.at[0, 0].set(np.nan)
     scales = gaussians.scales.at[1].set(np.inf).at[2].set(1e6)
     opacities = gaussians.opacities.at[3].set(0.0).at[4].set(1 / 256)
-    splats = visible_splats(
-        replace(gaussians, means=means, scales=scales, opacities=opacities), 0.1, max_gaussians=1000
-    )
+    spoiled = replace(gaussians, means=means, scales=scales, opacities=opacities)
+    splats = visible_splats(spoiled, 0.1, max_gaussians=1000)
     assert len(splats["centers"]) == 60 - 4
     assert all(np.isfinite(x).all() for x in splats.values())
     assert np.isfinite(splats["covariances"].astype(np.float16)).all()
@@ -79,10 +78,7 @@ def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
     for number, more in enumerate(deltas[1:], start=2):
         save_delta(tmp_path / "deltas" / f"{4 * number:06d}.npz", more, stream)
     found = source.changed()
-    known = None
-    for part in deltas:
-        known = apply_delta(known, part)
-    known = jax.tree.map(jnp.asarray, known)
+    known = jax.tree.map(jnp.asarray, functools.reduce(apply_delta, deltas, None))
     wanted = frame(origin).gaussians_to_capture(known)
     for name in ("means", "quats", "scales", "opacities", "sh"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
@@ -110,7 +106,7 @@ def test_a_growing_run_is_shown_at_its_middle_exposure(tmp_path):
     colors = []
     for number, (part, exposure) in enumerate(parts, start=1):
         save_delta(tmp_path / "deltas" / f"{4 * number:06d}.npz", part, header(exposure=exposure))
-        colors.append(0.5 + 0.28209479 * np.asarray(source.changed().sh[:4, 0], np.float64))
+        colors.append(0.5 + SH_C0 * np.asarray(source.changed().sh[:4, 0], np.float64))
     np.testing.assert_allclose(colors[1], colors[0] * [3.0, 2.0, 0.5], atol=1e-6)
 
 
