@@ -86,6 +86,25 @@ def test_pivots_are_bounded_inside_their_voxels_findable_and_counted(stream):
     assert stats.num_seen == sum(r.num_valid for r in stream) == stats.num_accepted + left_out
 
 
+@SETTINGS
+@given(st.lists(streams.recipes, min_size=1, max_size=3), st.integers(1, streams.NUM_TOKENS - 1))
+def test_splitting_a_chunk_changes_nothing(stream, at):
+    whole, split = init_cache(streams.CONFIG, streams.CAPACITY), init_cache(streams.CONFIG, streams.CAPACITY)
+    for recipe in stream:
+        tokens = streams.to_jax(recipe.tokens())
+        head = jnp.arange(streams.NUM_TOKENS) < at
+        whole = streams.fuse(whole, tokens, streams.CONFIG)
+        split = streams.fuse(split, replace(tokens, valid=tokens.valid & head), streams.CONFIG)
+        split = streams.fuse(split, replace(tokens, valid=tokens.valid & ~head), streams.CONFIG)
+    means = ("means", "feats", "rgbs")
+    streams.assert_same_cache(whole, split, except_fields=("table", "last_chunks", *means))
+    for name in means:
+        a, b = np.asarray(getattr(whole, name)), np.asarray(getattr(split, name))
+        np.testing.assert_allclose(a, b, rtol=0, atol=streams.VALUE_RTOL * np.abs(a).max(initial=1e-30))
+    for name in ("num_seen", "num_accepted", "num_merged", "num_dropped"):
+        assert int(getattr(whole.stats, name)) == int(getattr(split.stats, name))
+
+
 @pytest.mark.parametrize("places", ["few", "edges"])
 def test_padding_is_the_identity(places):
     before = run([streams.Recipe(seed=5, places=places, features="normal", confidences="random")])
