@@ -6,7 +6,9 @@ import struct
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
+from ssplat_jax.data.images import image_flags
 from tests.badinputs.cases import HEIGHT, WIDTH, another, depth_map, opened
 from tests.data.capture_fixture import smooth_capture
 
@@ -48,6 +50,13 @@ def test_every_kind_of_image_becomes_rgb(tmp_path, kind):
     image = opened(tmp_path, another(2, "2.tif", KINDS[kind])).image(2)
     assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.float32
     np.testing.assert_allclose(image, 1.0 if kind == "1 bit" else 0.6, atol=3 * EIGHT_BITS)
+
+
+def test_flags_of_an_image_are_read_without_decoding_it(tmp_path, monkeypatch):
+    decoded = []
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
+    monkeypatch.setattr(PngImageFile, "load", lambda image: decoded.append(image))
+    assert image_flags(tmp_path / "a.png") == (False, False) and not decoded
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -100,6 +100,9 @@ def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
     records = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
     assert [record["step"] for record in records] == list(range(1, 17))
     assert_same_bits(problems.train_quadratic(tmp_path / "parts").params, whole.params)  # a finished run is only read
+    other = jax.tree.map(lambda x: x + 1, problems.start_params())
+    with pytest.raises(InputError, match="init_weights"):
+        loop.train(NARROW, problems.QUADRATIC, tmp_path / "parts", params=other)
 
 
 @pytest.mark.slow  # compiles a whole step that renders
