@@ -28,7 +28,7 @@ def test_depth_errors_ignore_scale_and_are_binned():
     np.testing.assert_allclose(errors, [0.9802, 0.0891, 0.0099, 0.0099], atol=1e-4)
     assert sum(entry["tokens"] for entry in row["by_confidence"]) == 5
     row = summary(np.array([1.0, 1.0, 1.0, 1.2, 1.4]), np.array([0.3, 0.4, 0.5, 0.8, 0.9]), tau=0.0)
-    # Of the surest 1, 2, 4, 4 and 5 tokens.
+    # Errors of the surest 1, 2, 4, 4 and 5 tokens.
     found = {entry["share"]: entry["median_error"] for entry in row["by_share"]}
     assert found == pytest.approx({0.25: 0.4, 0.5: 0.3, 0.75: 0.1, 0.85: 0.1, 1.0: 0.0})
 
