@@ -5,7 +5,7 @@ second run spends before its first image. Here a program is known by what it is 
 versions, device, configuration of JAX and XLA, the function with its static arguments, shapes and dtypes. A store is
 used where `SWITCH` names its folder, as the commands do (`commands/program_cache.py`); elsewhere a `Kept` is `jax.jit`.
 
-Views of embedded scenes are kept there too (`kept_arrays`).
+Views of embedded scenes and the depths of captures are kept there too (`kept_result`).
 
 An entry is unpickled and holds machine code: one is read only if this user alone can have written it. One that is cut
 short, damaged or of another program is compiled again and replaced.
@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import zstandard
 from jax.core import Tracer
 from jax.experimental import serialize_executable
@@ -198,23 +199,23 @@ def _use_jax_cache(*, on: bool) -> None:
         compilation_cache.reset_cache()  # JAX looks at its switch once, until then
 
 
-def kept_arrays(function: Callable, *arguments: Any) -> Any:
-    """`function(*arguments)`, kept where programs are: NumPy arrays that follow from this package and the arguments.
+def kept_result(make: Callable[[], Any], *facts: Any) -> Any:
+    """`make()`, kept where programs are: arrays and numbers that follow from this package and `facts`.
 
     Args:
-        function: a function of this package.
-        arguments: `repr` tells them apart.
+        make: computes the result.
+        facts: what is computed, and all that it depends on; `repr` tells them apart.
     """
-    if not os.environ.get(SWITCH) or (name := _identity(function)) is None:
-        return function(*arguments)
-    key = f"{_place()} {_settings()} {name} {arguments}"
+    if not os.environ.get(SWITCH):
+        return make()
+    key = f"{_place()} {_settings()} {facts}"
     with contextlib.suppress(Exception):  # as for programs
         return _read(key)
-    arrays = function(*arguments)
-    if sum(x.nbytes for x in jax.tree.leaves(arrays)) <= MOST_ARRAY_BYTES:
+    result = make()
+    if sum(np.asarray(x).nbytes for x in jax.tree.leaves(result)) <= MOST_ARRAY_BYTES:
         with contextlib.suppress(Exception):
-            _write(key, arrays)
-    return arrays
+            _write(key, result)
+    return result
 
 
 def _file(key: str) -> Path:

@@ -22,6 +22,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import echo, refusal
+from ssplat_jax.core.kept_programs import kept_result
 from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, stream_scale
 from ssplat_jax.data.images import Crop, decode_depth, decode_image, decode_mask, undistort
@@ -43,13 +44,14 @@ class Pixels(Protocol):
 
     `image` delivers RGB in [0, 1] at the size of `crop`; `seen` the pixels of it that are not masked out, or None if
     all count; `depth` the stored map (camera z in capture units, 0 where unknown), or None if there is none, which
-    `has_depth` tells without decoding it.
+    `has_depth` tells without decoding it. `version` is another text once the stored image or mask is another.
     """
 
     def image(self, i: int, crop: Crop) -> Float32[np.ndarray, "h w 3"]: ...
     def seen(self, i: int, crop: Crop) -> Bool[np.ndarray, "h w"] | None: ...
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None: ...
     def has_depth(self, i: int) -> bool: ...
+    def version(self, i: int) -> str: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,6 +99,13 @@ class FilePixels:
     def has_depth(self, i: int) -> bool:
         return self.frames[i].depth_path is not None
 
+    def version(self, i: int) -> str:
+        paths = [path for path in (self.frames[i].path, self.frames[i].mask_path) if path is not None]
+        try:
+            return " ".join(f"{path.resolve()} {(x := path.stat()).st_size} {x.st_mtime_ns}" for path in paths)
+        except OSError:  # whoever decodes it says so
+            return "unreadable"
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ArrayPixels:
@@ -117,6 +126,10 @@ class ArrayPixels:
 
     def has_depth(self, i: int) -> bool:
         return True
+
+    def version(self, i: int) -> str:
+        parts = (self.images[i], np.zeros(0) if self.masks is None else self.masks[i])
+        return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -252,7 +265,9 @@ class Capture:
         used = _indices(self, indices)
         if config.stream.causal:
             used = used[: config.stream.chunk_size]
-        depths = estimate_depths(self, used)
+        # A second run finds them while poses, cameras, the size, images and masks are the same.
+        facts = (self.digest(used), self.width, self.height, list(map(self.pixels.version, used)))
+        depths = kept_result(lambda: estimate_depths(self, used), "depths", *facts)
         scale, near, far = stream_scale(depths, config)
         first = self.frames[used[0]].camtoworld
         warnings = self.depth_map_warnings(depths) if self.brings_depth else []

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ssplat_jax.core.errors import InputError, echo, reading, refusal
-from ssplat_jax.core.kept_programs import kept_arrays
+from ssplat_jax.core.kept_programs import kept_result
 from ssplat_jax.data.capture import MAX_SIDE, ArrayPixels, Capture, FilePixels, capture_of_listing
 from ssplat_jax.data.images import MAX_PIXELS
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, split_options
@@ -163,7 +163,7 @@ def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
     from ssplat_jax.data.procedural.procedural_views import procedural_capture_arrays
 
     wanted = (name, num_frames, height, width, seed)
-    images, depths, camtoworlds, Ks = kept_arrays(procedural_capture_arrays, *wanted)
+    images, depths, camtoworlds, Ks = kept_result(lambda: procedural_capture_arrays(*wanted), "views", *wanted)
     frames = tuple(
         Frame(f"{name}/{i:05d}", check_camtoworld(pose, spec)[0], K.astype(np.float64), width, height)
         for i, (pose, K) in enumerate(zip(camtoworlds, Ks, strict=True))

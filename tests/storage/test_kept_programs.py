@@ -1,5 +1,6 @@
 """Executables on disk: a second process neither traces nor compiles, and nothing in the store can spoil a result."""
 
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
@@ -17,13 +18,19 @@ import pytest
 from ssplat_jax.cache.fuse import fuse
 from ssplat_jax.cache.state import init_cache
 from ssplat_jax.core import kept_programs
-from ssplat_jax.core.kept_programs import SWITCH, Kept
+from ssplat_jax.core.kept_programs import SWITCH, Kept, kept_result
 from ssplat_jax.core.numerics import safe_sqrt
+from ssplat_jax.data import capture as capture_module
+from ssplat_jax.data.depth_range import estimate_depths
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.procedural import procedural_views
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session, feed_capture
+from tests.badinputs.cases import make_capture
 from tests.cache.streams import CONFIG, Recipe, to_jax
+from tests.data.capture_fixture import smooth_capture, with_poses
+from tests.data.capture_writers import write_image
+from tests.data.test_masks import write_mask
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 
@@ -206,16 +213,49 @@ def test_what_cannot_be_told_apart_is_not_kept(store):
 
 
 def test_an_embedded_scene_is_made_once_and_again_where_its_entry_is_damaged(store, monkeypatch):
-    made, arrays_of = [], procedural_views.procedural_capture_arrays
+    made, wanted = [], ("room", 2, 16, 24, 0)
     cast = procedural_views._cast
     monkeypatch.setattr(procedural_views, "_cast", lambda *given: made.append(0) or cast(*given))
-    wanted = ("room", 2, 16, 24, 0)
-    first, again = (kept_programs.kept_arrays(arrays_of, *wanted) for _ in range(2))
+
+    def views(*wanted):
+        return kept_result(lambda: procedural_views.procedural_capture_arrays(*wanted), "views", *wanted)
+
+    first, again = views(*wanted), views(*wanted)
     assert len(made) == 1
     for x, y in zip(first, again, strict=True):
         np.testing.assert_array_equal(x, y)
     for entry in store.iterdir():
         entry.write_bytes(entry.read_bytes()[:-9])
-    kept_programs.kept_arrays(arrays_of, *wanted)
-    kept_programs.kept_arrays(arrays_of, "room", 2, 16, 24, 1)
+    views(*wanted)
+    views("room", 2, 16, 24, 1)
     assert len(made) >= 3
+
+
+def test_depths_of_a_capture_are_estimated_once_until_a_frame_is_another(store, tmp_path, monkeypatch):
+    estimated, found = [], {}
+    counted = lambda *given: estimated.append(0) or estimate_depths(*given)  # noqa: E731
+    monkeypatch.setattr(capture_module, "estimate_depths", counted)
+
+    def num_estimated(opened):
+        frame = opened.stream_frame(CONFIG)
+        range_and_scale = (frame.near, frame.far, frame.scale)
+        assert found.setdefault(len(estimated), range_and_scale) == range_and_scale
+        return len(estimated)
+
+    def in_files(**options):
+        return num_estimated(open_capture(root, **options))
+
+    root = make_capture(tmp_path / "files")
+    assert [in_files(), in_files()] == [1, 1]
+    write_image(root / "images" / "1.jpg", 9)
+    assert [in_files(), in_files()] == [2, 2]
+    write_mask(root / "masks" / "1.png")
+    assert [in_files(), in_files(size=(32, 24)), in_files()] == [3, 4, 4]
+    moved = open_capture(root)
+    poses = moved.camtoworlds
+    poses[:, :3, 3] *= 2
+    assert num_estimated(with_poses(moved, poses)) == 5
+    arrays = smooth_capture()
+    assert [num_estimated(arrays), num_estimated(arrays)] == [6, 6]
+    images = arrays.pixels.images + np.float32(0.01)
+    assert num_estimated(dataclasses.replace(arrays, pixels=dataclasses.replace(arrays.pixels, images=images))) == 7

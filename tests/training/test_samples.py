@@ -150,6 +150,7 @@ def with_depth_maps(capture, has_depth):
     class Pixels:
         image = staticmethod(capture.pixels.image)
         seen = staticmethod(capture.pixels.seen)
+        version = staticmethod(capture.pixels.version)
         depth = staticmethod(lambda i: capture.pixels.depth(i) if has_depth(i) else None)
 
     Pixels.has_depth = staticmethod(has_depth)

@@ -120,7 +120,7 @@ def test_the_anchor_learns_alone(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3, 4, 5, 6, 7], [0, 2, 4, 6, 1, 3, 5, 7]], ids=["in order", "dealt out"])
 def test_parts_of_a_stream_are_cells_of_its_later_chunks(order, monkeypatch):
-    """Those that a model finds which takes the same chunks one after the other."""
+    """The cells of a part are those that a model finds which takes the same chunks one after the other."""
     monkeypatch.setattr(anchors, "DEALT_OUT", float(order[1] == 2))
     model, params, said = StreamSplat(SMALL), random_params(SMALL), []
     start = TrainingStart(model, params, None, 3, 4, said.append)
