@@ -93,7 +93,8 @@ def _stream(run: OpenRun, source: "WholeCapture | GrowingCapture", options: Run,
                 deltas.write()
                 record_chunk(run, fed)
                 advance(run.num_views)
-                if number % options.save_every == 0:
+                every = options.save_every
+                if time.monotonic() >= run.next_save if every is None else number % every == 0:
                     run.save()
                 if interrupts.received:
                     break

@@ -12,6 +12,7 @@ are the commands that come after it, because their results would mix two scenes.
 
 import contextlib
 import dataclasses
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,9 @@ from ssplat_jax.storage.saved_states import check_same, load_newest_state, resto
 from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.streaming.session import Exposures, FedChunk, Session, begin_stream
 
+SAVE_SECONDS, SAVE_SHARE = 30.0, 0.1
+"""Seconds between two saves of a stream, or more, so that saving takes at most this share of the time."""
+
 
 @dataclasses.dataclass
 class OpenRun:
@@ -50,6 +54,7 @@ class OpenRun:
     exposures: Exposures = dataclasses.field(default_factory=dict)  # of the views streamed so far
     images: dict[str, str] = dataclasses.field(default_factory=dict)  # digest of the file of each of them
     num_saved: int = 0  # views in the saved state
+    next_save: float = dataclasses.field(default_factory=lambda: time.monotonic() + SAVE_SECONDS)  # monotonic clock
 
     @property
     def num_views(self) -> int:
@@ -83,6 +88,7 @@ class OpenRun:
         if self.num_views == self.num_saved:
             return
         assert self.session.cache is not None  # views have been streamed
+        began = time.monotonic()
         state = {
             "frame": self.stream_frame.to_dict(),
             "done": self.num_views,
@@ -90,7 +96,8 @@ class OpenRun:
             "images": self.images,  # of streamed views alone: a damaged image further on may still be replaced
         }
         save_state(self.folder.state, self.session.cache, self.identity() | state)
-        self.num_saved = self.num_views
+        self.num_saved, ended = self.num_views, time.monotonic()
+        self.next_save = ended + max(SAVE_SECONDS, (ended - began) / SAVE_SHARE)
 
     def resume(self, reporter: Reporter) -> None:
         """Continues from the saved state of this run; if it is damaged, from the one before it, with a warning.

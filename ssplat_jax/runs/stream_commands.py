@@ -225,8 +225,8 @@ class Run(StreamOptions):
     quality: QualityOption = "best"
     max_views: int | None = None
     """Stop after this many views."""
-    save_every: int = 8
-    """Chunks between saved states."""
+    save_every: int | None = None
+    """Chunks between two saves of the stream; by default those of half a minute. A stop saves too."""
     overwrite: bool = False
     """Remove the run in the folder and start anew."""
     deltas: bool = False

@@ -1,6 +1,7 @@
 """A run folder: damaged states, what identifies a run, and poses that are adjusted once, then used everywhere."""
 
 import contextlib
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,12 +15,15 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses import adjust_poses as adjusting
-from ssplat_jax.runs import open_run
+from ssplat_jax.runs import capture_run, open_run
+from ssplat_jax.runs.stream_commands import Run
 from ssplat_jax.storage.chunk_records import load_chunk_records, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
 from tests.data.capture_fixture import with_poses
+from tests.model.small import random_params
 from tests.runs.test_run_results import record
+from tests.streaming.narrow_model import FEW_GAUSSIANS
 
 CAPTURE, SIZE = "procedural:room?frames=8", (64, 48)
 QUIET = Reporter(quiet=True)
@@ -62,6 +66,30 @@ def test_a_damaged_state_is_kept_aside_and_the_one_before_takes_its_place(captur
     aside = folder.state.with_name(folder.state.name + ".damaged")
     held = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert held == {folder.state.name: good, aside.name: damaged}
+
+
+def test_saves_take_at_most_a_tenth_of_the_time(capture, tmp_path, monkeypatch):
+    times = iter([100.0, 200.0, 200.5, 300.0, 308.0])  # of the opening, and around two saves
+    monkeypatch.setattr(open_run, "time", SimpleNamespace(monotonic=lambda: next(times)))
+    with opened(capture, tmp_path) as run:
+        due = [run.next_save]
+        for count in (4, 8, 8):  # the last is saved already
+            save_views(run, count)
+            due.append(run.next_save)
+    assert due == [130.0, 230.5, 388.0, 388.0]
+
+
+@pytest.mark.parametrize(("seconds", "every", "saved"), [(0.0, None, [4, 8]), (1e9, None, [8]), (1e9, 1, [4, 8])])
+def test_a_stream_is_saved_when_it_is_due_and_at_its_end(seconds, every, saved, tmp_path, monkeypatch, programs_shared):
+    monkeypatch.setattr(open_run, "SAVE_SECONDS", seconds)
+    monkeypatch.setattr(open_run, "SAVE_SHARE", np.inf)
+    monkeypatch.setattr(capture_run, "finish_run", lambda *given: 0)
+    done, save = [], open_run.save_state
+    monkeypatch.setattr(open_run, "save_state", lambda *given: done.append(given[2]["done"]) or save(*given))
+    options = Run("procedural:room?frames=8&size=64x48", tmp_path, save_every=every)
+    params = random_params(FEW_GAUSSIANS)
+    assert capture_run.run_capture(StreamSplat(FEW_GAUSSIANS), params, options, QUIET) == 0
+    assert done == saved
 
 
 def test_no_readable_state_suggests_overwrite(capture, tmp_path):

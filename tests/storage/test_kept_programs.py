@@ -250,12 +250,16 @@ def test_depths_of_a_capture_are_estimated_once_until_a_frame_is_another(store, 
     write_image(root / "images" / "1.jpg", 9)
     assert [in_files(), in_files()] == [2, 2]
     write_mask(root / "masks" / "1.png")
-    assert [in_files(), in_files(size=(32, 24)), in_files()] == [3, 4, 4]
+    assert [in_files(), in_files()] == [3, 3]
+    write_mask(root / "masks" / "1.png", white=200)
+    assert [in_files(), in_files(size=(32, 24)), in_files()] == [4, 5, 5]
     moved = open_capture(root)
     poses = moved.camtoworlds
     poses[:, :3, 3] *= 2
-    assert num_estimated(with_poses(moved, poses)) == 5
+    assert num_estimated(with_poses(moved, poses)) == 6
     arrays = smooth_capture()
-    assert [num_estimated(arrays), num_estimated(arrays)] == [6, 6]
-    images = arrays.pixels.images + np.float32(0.01)
-    assert num_estimated(dataclasses.replace(arrays, pixels=dataclasses.replace(arrays.pixels, images=images))) == 7
+    assert [num_estimated(arrays), num_estimated(arrays)] == [7, 7]
+    others = {"images": arrays.pixels.images + np.float32(0.01), "masks": np.ones(arrays.pixels.depths.shape, bool)}
+    for number, (name, values) in enumerate(others.items(), start=8):
+        pixels = dataclasses.replace(arrays.pixels, **{name: values})
+        assert num_estimated(dataclasses.replace(arrays, pixels=pixels)) == number
