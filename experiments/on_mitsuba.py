@@ -1,6 +1,6 @@
 """Mitsuba's ray tracer of Gaussians for `ssplat bench render`: another renderer that needs no CUDA, with gradients.
 
-    pip install mitsuba    # it compiles by LLVM, a package of the system such as Debian's libllvm15
+    pip install mitsuba    # it compiles by LLVM, a package of the system such as Debian's libllvm19; 15 is too old
     ssplat bench render --against experiments/on_mitsuba.py
 
 A ray meets the Gaussians one after the other, and their density is taken in three dimensions ("3D Gaussian Ray
