@@ -81,11 +81,6 @@ def candidates(means, quats, scales, opacities, colors, viewmat, K, width: int, 
     return {"forward": forward, "forward_backward": forward_backward}
 
 
-def with_gsplat(gaussians: Gaussians, camera: Camera) -> tuple[Runs, Row]:
-    """gsplat on our scene."""
-    return bench_render.runs_of(candidates, gaussians, camera), {}
-
-
 def with_splax(gaussians: Gaussians, camera: Camera) -> tuple[Runs, Row]:
     """splax on our scene, and how far its images and gradients are from ours, relative to the largest of them."""
     import splax  # pyright: ignore[reportMissingImports]
@@ -120,7 +115,7 @@ def with_splax(gaussians: Gaussians, camera: Camera) -> tuple[Runs, Row]:
     return runs, {"error": found}
 
 
-OTHERS = {"gsplat": with_gsplat, "splax": with_splax}
+OTHERS = {"gsplat": lambda *scene: (bench_render.runs_of(candidates, *scene), {}), "splax": with_splax}
 
 
 def rasterizers(scale: str) -> list[Row]:

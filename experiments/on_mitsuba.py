@@ -24,8 +24,8 @@ AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # of Mitsuba's cameras in ours: x to the
 def mitsuba_scene(means, quats, scales, opacities, colors, viewmat, K, width: int, height: int):
     """Mitsuba's scene of Gaussians and one camera, from arrays of NumPy; the principal point is the image's center."""
     mi.set_variant("llvm_ad_rgb")
-    parts = {"centers": means, "scales": scales, "quaternions": quats[:, [1, 2, 3, 0]]}
-    parts["quaternions"] = parts["quaternions"] / np.linalg.norm(quats, axis=-1, keepdims=True)
+    quats = quats[:, [1, 2, 3, 0]] / np.linalg.norm(quats, axis=-1, keepdims=True)
+    parts = {"centers": means, "scales": scales, "quaternions": quats}
     parts |= {"opacities": opacities[:, None], "sh_coeffs": (colors - 0.5) / SH_C0}
     arrays = {name: mi.TensorXf(np.ascontiguousarray(part, np.float32)) for name, part in parts.items()}
     sensor = {

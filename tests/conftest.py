@@ -42,9 +42,6 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
 
-SHARED = Path(__file__).resolve().parents[2] / "shared"
-
-
 # Workers take whole files, in this order: the long ones first, so that no worker ends long after the others.
 LONG_FILES = (
     "tests/training/",
@@ -78,7 +75,7 @@ def programs_end_with_their_file():
 
 
 def _shared(name: str) -> Path:
-    folder = SHARED / name
+    folder = Path(__file__).resolve().parents[2] / "shared" / name
     if not folder.is_dir():
         pytest.skip(f"no ../shared/{name} beside the repository: real data is not part of it")
     return folder

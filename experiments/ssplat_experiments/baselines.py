@@ -119,36 +119,26 @@ class JointNetwork:
 
     def __init__(self, config: StreamConfig, params: dict, chunk: Chunk) -> None:
         self.params, self.chunk = params, chunk
-        self.program = _program(joint_config(config, len(chunk.images)), *abstract((params, chunk)))
+        self.program = program(joint_config(config, len(chunk.images)), *abstract((params, chunk)))
 
     def gaussians(self) -> Gaussians:
         """The scene of all views, in the stream frame."""
         return jax.block_until_ready(self.program(self.params, self.chunk))
 
-    def network_bytes(self) -> int | None:
-        """Bytes in use while the network runs."""
-        added = added_bytes(self.program)
-        return None if added is None else added + live_bytes((self.params, self.chunk))
-
     def peak_memory(self, camera: Camera) -> dict[str, int | str | None]:
         """Memory of running the network, which decodes within, and of rendering a view."""
         gaussians = self.gaussians()
         rendering = render_bytes(gaussians, camera)
-        held = live_bytes((self.params, gaussians))
+        added, held = added_bytes(self.program), live_bytes((self.params, gaussians))
         return memory_row(
-            step=(network := self.network_bytes()),
+            step=(network := None if added is None else added + live_bytes((self.params, self.chunk))),
             decode=network,
             render=None if rendering is None else held + rendering,
         )
 
 
-def forget() -> None:
-    """Keeps no programs any longer."""
-    _program.cache_clear()
-
-
 @functools.lru_cache(maxsize=4)
-def _program(config: StreamConfig, structure: Any, leaves: tuple) -> jax.stages.Compiled:
+def program(config: StreamConfig, structure: Any, leaves: tuple) -> jax.stages.Compiled:
     """The compiled network for the shapes of its parameters and views."""
     model = StreamSplat(config)
 

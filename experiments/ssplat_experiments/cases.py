@@ -42,11 +42,6 @@ class Case:
         weights = {} if self.config is None else {"weights": weights_digest()}
         return json.loads(json_text(request | weights))
 
-    @property
-    def hash(self) -> str:
-        """Hash of 12 hexadecimal digits of the request."""
-        return hashlib.sha256(json.dumps(self.request, sort_keys=True).encode()).hexdigest()[:12]
-
     def path(self, folder: Path) -> Path:
         """The file of the case."""
         return folder / (re.sub(r"[^a-z0-9.]+", "_", self.name.lower()).strip("_") + ".json")
@@ -114,7 +109,6 @@ def _record(name: str, case: Case, rows: list[Row], seconds: float) -> dict[str,
         "experiment": name,
         "case": case.name,
         "request": case.request,
-        "request_hash": case.hash,
         "config": case.config and case.config.hash,
         "commit": commit(),
         "date": today(),
@@ -129,11 +123,11 @@ def _read(case: Case, folder: Path) -> dict[str, Any]:
     path = case.path(folder)
     try:
         record = json.loads(path.read_text())
-        held, rows = record["request_hash"], record["rows"]
+        held, _ = record["request"], list(record["rows"])
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path}: wanted the result of case {case.name!r}, got something else; remove it.") from None
-    if held != case.hash or not isinstance(rows, list):
-        name, before, now = first_difference(record.get("request"), case.request) or ("request_hash", held, case.hash)
+    if found := first_difference(held, case.request):
+        name, before, now = found
         raise InputError(
             f"{path}: was measured with another request ({name}: {before!r}, wanted now {now!r}); choose another --out,"
             " or remove the file to measure it again."

@@ -36,6 +36,8 @@ OURS, APPEND, JOINT = "ours", "append-all", "joint"
 NUM_TARGETS = 16
 NUM_TIMED = 4  # last chunks that are timed at each number of views
 
+_open_capture = functools.lru_cache(maxsize=1)(open_capture)  # the cases of a suite follow each other
+
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
@@ -103,15 +105,6 @@ def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
     return streams + joint
 
 
-def _suite(path: str) -> str:
-    return path if path.startswith("procedural:") else Path(path).name
-
-
-@functools.lru_cache(maxsize=1)
-def _open(path: str, size: tuple[int, int]) -> Capture:
-    return open_capture(path, size=size)
-
-
 def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list[Row]:
     """A row for each number of views; with our memory, one for each image baseline too."""
     capture, split, stream_frame = _opened(path, config, sizes)
@@ -120,7 +113,7 @@ def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list
     for fed, count in itertools.pairwise((0, *sizes.counts)):
         found, recent = feed_capture(session, capture, split.context[fed:count], stream_frame, num_recent=NUM_TIMED)
         exposures |= found
-        place = {"suite": _short(path) + sizes.label, "views": count}
+        place = {"suite": _suite(path) + sizes.label, "views": count}
         seen = split.context[:count] if method == OURS else ()
         scored = _scores(session.gaussians(), capture, split.targets, stream_frame, exposures, seen)
         memory, latency = peak_memory(session, middle), measure_latency(session, recent, middle)
@@ -143,7 +136,7 @@ def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list
 
 def measured_joint(path: str, counts: Sequence[int], config: StreamConfig, sizes: Sizes) -> list[Row]:
     """Rows of the joint network; the first number of views that does not fit is `OOM`, and nothing larger is tried."""
-    place, rows = {"suite": _short(path) + sizes.label, "method": JOINT}, []
+    place, rows = {"suite": _suite(path) + sizes.label, "method": JOINT}, []
     for count in counts:
         try:
             rows.append(place | {"views": count} | joint_row(path, count, config, sizes))
@@ -168,13 +161,13 @@ def joint_row(path: str, count: int, config: StreamConfig, sizes: Sizes) -> Row:
 
 def _opened(path: str, config: StreamConfig, sizes: Sizes) -> tuple[Capture, Split, StreamFrame]:
     """Capture, split, and the stream frame of the whole context: near and far are known, as the paper has them."""
-    capture = _open(path, sizes.size)
+    capture = _open_capture(path, size=sizes.size)
     split = paper_split(len(capture), max(sizes.counts), targets=sizes.targets)
     return capture, split, capture.stream_frame(config, split.context)
 
 
-def _short(path: str) -> str:
-    return _suite(path).removeprefix("procedural:").partition("?")[0]
+def _suite(path: str) -> str:
+    return Path(path).name.removeprefix("procedural:").partition("?")[0]
 
 
 def _scores(

@@ -60,4 +60,4 @@ def _session(config: StreamConfig) -> Session:
 
 def make_room() -> None:
     """Drops compiled programs, of kept sessions too, before the process holds more than Linux lets it map."""
-    cpu_backend.make_room(_session.cache_clear, baselines.forget)
+    cpu_backend.make_room(_session.cache_clear, baselines.program.cache_clear)

@@ -77,16 +77,8 @@ def multiply_quats(a: Float[Array, "*s 4"], b: Float[Array, "*s 4"]) -> Float[Ar
 
 
 _C1 = 0.4886025119029199
-_C2 = (1.0925484305920792, 1.0925484305920792, 0.31539156525252005, 1.0925484305920792, 0.5462742152960396)
-_C3 = (
-    0.5900435899266435,
-    2.890611442640554,
-    0.4570457994644658,
-    0.3731763325901154,
-    0.4570457994644658,
-    1.445305721320277,
-    0.5900435899266435,
-)
+_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
 def sh_basis(directions: Float[AnyArray, "*s 3"], degree: int) -> Float[AnyArray, "*s k"]:
@@ -102,16 +94,16 @@ def sh_basis(directions: Float[AnyArray, "*s 3"], degree: int) -> Float[AnyArray
         terms += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        terms += [_C2[0] * x * y, -_C2[1] * y * z, _C2[2] * (2 * zz - xx - yy), -_C2[3] * x * z, _C2[4] * (xx - yy)]
+        terms += [_C2[0] * x * y, -_C2[0] * y * z, _C2[1] * (2 * zz - xx - yy), -_C2[0] * x * z, _C2[2] * (xx - yy)]
         if degree >= 3:
             terms += [
                 -_C3[0] * y * (3 * xx - yy),
                 _C3[1] * x * y * z,
                 -_C3[2] * y * (4 * zz - xx - yy),
                 _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-                -_C3[4] * x * (4 * zz - xx - yy),
-                _C3[5] * z * (xx - yy),
-                -_C3[6] * x * (xx - 3 * yy),
+                -_C3[2] * x * (4 * zz - xx - yy),
+                _C3[4] * z * (xx - yy),
+                -_C3[0] * x * (xx - 3 * yy),
             ]
     return xp.stack(terms, axis=-1)
 

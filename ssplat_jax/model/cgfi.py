@@ -42,11 +42,6 @@ class Aggregator(nn.Module):
         return Conv(feats.shape[-1], kernel_init=_copy_first, name="leave")(jnp.concatenate([seen, x], axis=-1))
 
 
-def num_hints(config: StreamConfig) -> int:
-    """Channels that `Aggregator` sees beside f."""
-    return config.network.token_width + config.additions.residual_cgfi
-
-
 def inject_features(
     params,
     feats: Float[Array, "v hf wf c"],

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.model.cgfi import Aggregator, num_hints
+from ssplat_jax.model.cgfi import Aggregator
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.decoder import EvidenceHead, num_features
 from ssplat_jax.model.hpda import AnchorMaps, AnchorStrength, num_inputs
@@ -204,7 +204,7 @@ def _modules(config: StreamConfig, network: Network) -> dict:
         "hpda": (AnchorMaps(), (grid(num_inputs(config)),))
         if config.additions.anchor == "learned"
         else (AnchorStrength(), ()),
-        "cgfi": (Aggregator(config), (grid(c), grid(num_hints(config)), jnp.ones(v, bool))),
+        "cgfi": (Aggregator(config), (grid(c), grid(c + config.additions.residual_cgfi), jnp.ones(v, bool))),
     }
     if config.head.evidence:
         shared["evidence"] = (EvidenceHead(), (jnp.zeros((1, num_features())),))

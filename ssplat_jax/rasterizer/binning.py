@@ -78,11 +78,6 @@ BOX_SIZE = slice(-2, None)
 WITHOUT_BOX = slice(0, -4)  # the columns that compositing reads and that have gradients: shape and channels
 
 
-def num_channels(table: Float[Array, "m f"]) -> int:
-    """Number of channel columns of a table."""
-    return table.shape[1] - len(SHAPE_COLUMNS) - len(BOX_COLUMNS)
-
-
 def sorted_table(
     splats: Splats, channels: Float[Array, "b n c"], grid: Grid
 ) -> tuple[Float[Array, "m f"], Int[Array, " m"]]:

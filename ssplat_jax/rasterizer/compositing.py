@@ -80,7 +80,7 @@ def _by_platform(compute: Callable[[Schedule], Results]) -> Results:
 
 
 def _forward(grid: Grid, with_alpha: bool, table, intersections: TileIntersections, schedule: Schedule):
-    channels = binning.num_channels(table) + with_alpha  # a channel of ones becomes alpha
+    channels = table[:, binning.CHANNELS].shape[1] + with_alpha  # a channel of ones becomes alpha
 
     def batch(out, tiles):
         def step(_, values, alphas, transmittance, out):

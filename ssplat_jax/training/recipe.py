@@ -178,18 +178,14 @@ _PAPER_LOSS = RenderingLoss(
 )
 # Its voxels and its anchor have lengths in the units of the poses: scale, near and far are those of the capture.
 _PAPER_VIEWS = ViewSamples(4, ((256, 256),), num_targets=4, range_jitter=0.0)
-_PAPER_PHASE = Phase(
-    "paper",
-    100_000,
-    _PAPER_VIEWS,
-    _PAPER_LOSS,
-    (*MATCHER, *AFTER_MATCHER),
-    1e-4,
-    final_share=1.0,
-    warmup_steps=1,
+_PAPER_STAGES = (*MATCHER, *AFTER_MATCHER)
+PAPER_RECIPE = Recipe(
+    (Phase("paper", 100_000, _PAPER_VIEWS, _PAPER_LOSS, _PAPER_STAGES, 1e-4, final_share=1.0, warmup_steps=1),),
+    adam_b2=0.999,
+    clip_norm=None,
+    ema_decay=0.0,
+    captures_alone=True,
 )
-
-PAPER_RECIPE = Recipe((_PAPER_PHASE,), adam_b2=0.999, clip_norm=None, ema_decay=0.0, captures_alone=True)
 """The paper's training to the letter: 100,000 steps of AdamW at a constant 1e-4 with one sample of a capture each,
 through all stages. It needs LPIPS weights for the second term and a GPU, and starts from imported weights. Where the
 paper is silent, AdamW has PyTorch's defaults, and a sample four chunks and four targets of 256 x 256."""

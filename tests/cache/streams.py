@@ -1,4 +1,4 @@
-"""Token streams that are hard on the cache, and the comparison of caches with the reference and with each other."""
+"""Token streams that are hard on the cache, and the comparison of caches with the reference."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from ssplat_jax.cache.changes import WIDTH as CHANGE_WIDTH
 from ssplat_jax.cache.changes import settle, unpack
 from ssplat_jax.cache.fuse import fuse as plain_fuse
-from ssplat_jax.cache.state import PIVOT_FIELDS, Tokens, VoxelCache, init_cache, pivot_fields
+from ssplat_jax.cache.state import Tokens, VoxelCache, init_cache, pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.pytree import replace
 from tests.cache import numpy_reference as reference
@@ -137,13 +137,6 @@ def written_rows(cache: VoxelCache) -> set[int]:
     """Rows with a pivot that the last chunk wrote."""
     is_new = np.asarray(cache.alive & (cache.last_chunks == cache.stats.num_chunks - 1))
     return set(np.flatnonzero(is_new.any(axis=1)).tolist())
-
-
-def assert_same_cache(a: VoxelCache, b: VoxelCache, except_fields=()) -> None:
-    """All fields equal to the last bit, except the counters and the fields named."""
-    for name in ("voxels", "counts", "num_voxels", "table", *PIVOT_FIELDS):
-        if name not in except_fields:
-            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
 
 
 def assert_equal_to_reference(cache: VoxelCache, expected: dict) -> None:

@@ -63,10 +63,8 @@ def test_a_folder_of_scenes_without_an_index_gets_one_by_the_protocol(tmp_path):
 
 @pytest.mark.slow
 def test_an_evaluation_refines_at_the_streamed_size_and_scores_at_the_captures(tmp_path, narrow):
-    out = tmp_path / "eval"
-    capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
-    arguments = ("eval", str(capture), "--context", "8", "--quality", "fast", "--refine", "3", *narrow)
-    assert run(*arguments, "--out", str(out)) == 0
+    capture, out = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96)), tmp_path / "eval"
+    assert run("eval", capture, "--context", "8", "--quality", "fast", "--refine", "3", "--out", out, *narrow) == 0
     metrics = read(out / "metrics.json")
     assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1

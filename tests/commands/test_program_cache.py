@@ -12,16 +12,12 @@ from ssplat_jax.commands.program_cache import EXECUTABLES, FOLDER, IS_ON, SWITCH
 from tests.commands.command_fixture import read
 
 
-def plain_environment(folder: Path | str) -> dict[str, str]:
-    """The variables of a user who has set nothing but the folder."""
-    names = ("TF_CPP_MIN_LOG_LEVEL", FOLDER, IS_ON)
-    return {name: value for name, value in os.environ.items() if name not in names} | {SWITCH: str(folder)}
-
-
 @pytest.mark.slow
 def test_a_run_compiles_few_programs_and_with_kept_ones_none_to_the_same_bytes(tmp_path):
     """Kept programs that were cut off are replaced."""
     compile_seconds, written, compiled, kept = [], [], [], tmp_path / "programs"
+    unset = ("TF_CPP_MIN_LOG_LEVEL", FOLDER, IS_ON)  # by a user who has set nothing but the folder
+    user = {name: value for name, value in os.environ.items() if name not in unset}
     for number, where in enumerate(("off", kept, kept, kept)):
         out = tmp_path / f"run{number}"
         command = [sys.executable, "-m", "ssplat_jax.commands.start", "run", "procedural:room?frames=16&size=96x64"]
@@ -29,7 +25,7 @@ def test_a_run_compiles_few_programs_and_with_kept_ones_none_to_the_same_bytes(t
             [*command, "--refine", "0", "--out", str(out), "--quiet"],
             capture_output=True,
             text=True,
-            env=plain_environment(where) | {"JAX_LOG_COMPILES": "1", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"},
+            env=user | {SWITCH: str(where), "JAX_LOG_COMPILES": "1", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"},
         )
         compiled.append(done.stderr.count("Finished XLA compilation of"))
         assert done.returncode == 0 and "E1" not in done.stderr and "cpu_aot" not in done.stderr, done.stderr

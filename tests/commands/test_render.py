@@ -8,7 +8,6 @@ from PIL import Image
 import ssplat_jax as ss
 from ssplat_jax.core.gaussians import mean_color
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import Effects, fill_holes
 from ssplat_jax.runs.open_run import save_poses
 from ssplat_jax.scene_files.formats import save_gaussians
@@ -44,8 +43,7 @@ def capture(tmp_path):
 
 def wanted(capture, gaussians, i, antialias, *, filled=True):
     opened = capture if isinstance(capture, Capture) else ss.open_capture(capture)
-    camera = opened.camera(i, StreamFrame.at_camera(np.eye(4), scale=1.0, near=0.0, far=1.0))
-    out = ss.render(gaussians, camera, effects=Effects(antialias=antialias))
+    out = ss.render(gaussians, opened.camera(i), effects=Effects(antialias=antialias))
     return np.clip(fill_holes(out.color, out.alpha, mean_color(gaussians)) if filled else out.color, 0, 1)
 
 
@@ -61,8 +59,7 @@ def test_pictures_are_what_the_cameras_see_of_the_refined_scene(tmp_path, captur
         np.testing.assert_allclose(found, wanted(capture, loaded, i, "mip"), atol=0.51 * LEVEL)
     assert np.abs(picture(out / "views" / "00000.png") - picture(out / "views" / "00002.png")).max() > 0.1
     # Fewer pictures than before: the others do not stay.
-    arguments = ("--max-views", "1", "--over-black", "--quiet")
-    assert run("render", tmp_path / "run", capture, "--out", out, *arguments) == 0
+    assert run("render", tmp_path / "run", capture, "--out", out, "--max-views", "1", "--over-black", "--quiet") == 0
     (only,) = (out / "views").iterdir()
     np.testing.assert_allclose(picture(only), wanted(capture, loaded, 0, "mip", filled=False), atol=0.51 * LEVEL)
 

@@ -14,12 +14,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.atomic import previous_path
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.chunk_records import (
-    load_chunk_records,
-    load_delta,
-    open_thumbnail,
-    save_chunk_record,
-)
+from ssplat_jax.storage.chunk_records import load_chunk_records, load_delta, open_thumbnail, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.saved_states import load_state
 from ssplat_jax.storage.weights import load_weights

@@ -8,23 +8,16 @@ from ssplat_jax.core.cameras import pixel_grid, unproject
 PIXELS = 2e-3  # float32 of pixel coordinates up to a few thousand, after a handful of operations
 
 
-def intrinsics(num: int, seed: int = 0) -> np.ndarray:
-    """Random intrinsics with different focal lengths and an off-center principal point."""
-    rng = np.random.default_rng(seed)
-    Ks = np.tile(np.eye(3), (num, 1, 1))
-    Ks[:, 0, 0], Ks[:, 1, 1] = rng.uniform(200, 900, (2, num))
-    Ks[:, 0, 2], Ks[:, 1, 2] = rng.uniform(50, 400, (2, num))
-    return Ks
-
-
 def f32(x):
     return jnp.asarray(x, jnp.float32)
 
 
 def test_unprojected_points_lie_on_the_rays_of_their_pixels():
     rng = np.random.default_rng(2)
-    Ks, pixels = intrinsics(5), rng.uniform(-100, 2000, (5, 40, 2))
+    Ks, pixels = np.tile(np.eye(3), (5, 1, 1)), rng.uniform(-100, 2000, (5, 40, 2))
     depths = np.exp(rng.uniform(np.log(0.01), np.log(1e4), (5, 40)))
+    Ks[:, 0, 0], Ks[:, 1, 1] = rng.uniform(200, 900, (2, 5))
+    Ks[:, 0, 2], Ks[:, 1, 2] = rng.uniform(50, 400, (2, 5))
     points = np.asarray(unproject(f32(pixels), f32(depths), f32(Ks)), np.float64)
     seen = np.einsum("vij,vnj->vni", Ks, points)
     np.testing.assert_allclose(seen[..., :2] / seen[..., 2:], pixels, atol=PIXELS)

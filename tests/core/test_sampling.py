@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.numerics import bilinear_taps, correlate_warped, neighbor_offsets
+from tests.core.test_cameras import f32
 
 FLOAT32 = 2e-5  # sums of a dozen products of unit normals
-HEIGHT, WIDTH, CHANNELS = 5, 7, 6
+HEIGHT, WIDTH = 5, 7
 
 
 def coordinates(seed: int = 0) -> np.ndarray:
@@ -19,9 +20,9 @@ def coordinates(seed: int = 0) -> np.ndarray:
     return coords
 
 
-def arrays(seed: int = 0):
+def arrays(seed: int, channels: int = 6):
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(15, CHANNELS)), rng.normal(size=(HEIGHT, WIDTH, CHANNELS))
+    return rng.normal(size=(15, channels)), rng.normal(size=(HEIGHT, WIDTH, channels))
 
 
 def warp_then_correlate(reference, image, coords):
@@ -37,19 +38,14 @@ def warp_then_correlate(reference, image, coords):
     return out
 
 
-def f32(x):
-    return jnp.asarray(x, jnp.float32)
-
-
 def taps_at(coords):
-    x, y = np.moveaxis(np.asarray(coords, np.float32), -1, 0)
-    return bilinear_taps(jnp.asarray(x), jnp.asarray(y), HEIGHT, WIDTH)
+    x, y = jnp.moveaxis(f32(coords), -1, 0)
+    return bilinear_taps(x, y, HEIGHT, WIDTH)
 
 
 @pytest.mark.parametrize("channels", [6, 48, 1])
 def test_correlation_is_that_of_the_warped_map(channels):
-    rng = np.random.default_rng(5)
-    reference, source = rng.normal(size=(15, channels)), rng.normal(size=(HEIGHT, WIDTH, channels))
+    reference, source = arrays(5, channels)
     got = correlate_warped(f32(reference), f32(source), taps_at(coordinates()))
     np.testing.assert_allclose(got, warp_then_correlate(reference, source, coordinates()), atol=FLOAT32)
 
@@ -59,8 +55,7 @@ def test_gradient_is_the_finite_difference_of_the_oracle():
     (reference, source), coords = arrays(3), coordinates(3)
     total = lambda r, s: jnp.sum(correlate_warped(r, s, taps_at(coords)))  # noqa: E731
     by_reference, by_source = jax.grad(total, (0, 1))(f32(reference), f32(source))
-    rng = np.random.default_rng(4)
-    step_reference, step_source = rng.normal(size=reference.shape), rng.normal(size=source.shape)
+    step_reference, step_source = arrays(4)
     oracle = lambda r, s: warp_then_correlate(r, s, coords).sum()  # noqa: E731
     difference = oracle(reference + step_reference, source) - oracle(reference, source)
     assert np.sum(np.asarray(by_reference) * step_reference) == pytest.approx(difference, abs=1e-3)

@@ -60,8 +60,7 @@ def test_chunks_hold_the_frames_in_order_and_pad_the_last():
 
 
 def test_an_image_is_decoded_once_for_depth_range_and_stream(tmp_path, monkeypatch):
-    decoded = []
-    decode = capture_module.decode_image
+    decoded, decode = [], capture_module.decode_image
     monkeypatch.setattr(capture_module, "decode_image", lambda path, size: decoded.append(path) or decode(path, size))
     capture = open_capture(make_capture(tmp_path / "c"), size=(32, 24))
     assert sum(int(chunk.valid.sum()) for chunk in capture.chunks(StreamConfig())) == 4

@@ -143,8 +143,7 @@ def test_scores_are_those_of_the_pixels_that_are_seen():
     assert psnr(spoiled, target, seen) == pytest.approx(psnr(image[:, :25], target[:, :25]), rel=1e-12)
     assert ssim(spoiled, target, seen) == ssim(np.where(seen[..., None], image, target), target, seen)
     assert np.isnan(psnr(image, target, ~seen & seen))
-    everywhere = np.ones_like(seen)
-    assert psnr(image, target, everywhere) == psnr(image, target)
+    assert psnr(image, target, np.ones_like(seen)) == psnr(image, target)
 
 
 # -- a room in which a sphere moves -----------------------------------------------------------------------------------

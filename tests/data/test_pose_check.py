@@ -39,12 +39,9 @@ def test_the_convention_of_the_files_is_found(written, room, keypoints):
     assert max(fit.shares, key=lambda c: fit.shares[c]) == written
     assert fit.shares[written] > 0.7 and sorted(fit.shares.values())[-2] < 0.35
     warning = pose_warning(fit, USUAL)
-    if written == USUAL:
-        assert warning is None
-    else:
-        flags = {"opengl": "--axes opengl", "world-to-camera": "--poses world-to-camera"}
-        for value, flag in flags.items():
-            assert (flag in warning) == (value in (written.axes, written.poses))
+    assert (warning is None) == (written == USUAL)
+    for value, flag in (("opengl", "--axes opengl"), ("world-to-camera", "--poses world-to-camera")):
+        assert (flag in (warning or "")) == (value in (written.axes, written.poses))
 
 
 def test_poses_of_other_images_are_found(room, keypoints):

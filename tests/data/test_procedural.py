@@ -55,8 +55,7 @@ def test_only_yards_have_a_sky_that_is_infinitely_far(kind, monkeypatch):
 
 
 def test_same_seed_same_sample(samples):
-    again = training_sample(7, 6, 24, 32)
-    for a, b in zip(samples[7], again, strict=True):
+    for a, b in zip(samples[7], training_sample(7, 6, 24, 32), strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(samples[7][1], samples[8][1])
 

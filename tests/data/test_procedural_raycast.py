@@ -66,9 +66,6 @@ def cylinder_entry(origin, directions, center, radius, half, rotation):
     return entry
 
 
-POSE = look_at(np.array([0.3, -0.4, -3.1]), np.array([0.1, 0.1, 0.0])).astype(np.float32)
-
-
 @pytest.mark.parametrize("shape", ["box", "ball", "cylinder"])
 def test_solids_are_hit_at_their_analytic_depth(shape):
     b = empty_builder()
@@ -76,7 +73,8 @@ def test_solids_are_hit_at_their_analytic_depth(shape):
     center = np.array([0.2, -0.1, 0.4])
     half = {"box": np.array([0.9, 0.5, 0.3]), "ball": np.full(3, 0.8), "cylinder": np.array([0.4, 0.9, 0.4])}[shape]
     b.add(shape, center, half, Finish((0,)), rotation)
-    K, pose = np.array([[50, 0, 30.3], [0, 51, 25.1], [0, 0, 1]]), POSE.astype(np.float64)
+    K = np.array([[50, 0, 30.3], [0, 51, 25.1], [0, 0, 1]])
+    pose = look_at(np.array([0.3, -0.4, -3.1]), np.array([0.1, 0.1, 0.0])).astype(np.float32)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
     origin, directions = pose[:3, 3], rays @ pose[:3, :3].T
@@ -89,7 +87,7 @@ def test_solids_are_hit_at_their_analytic_depth(shape):
         entry = cylinder_entry(origin, directions, center, 0.4, 0.9, rotation)
     assert 50 < np.isfinite(entry).sum() < 0.9 * entry.size
     wanted = np.minimum(entry, slab_depths(origin, directions, np.zeros(3), ROOM, np.eye(3))[1])
-    depths = np.asarray(raycast(built(b), inverted(POSE[None]), K[None].astype(np.float32), HEIGHT, WIDTH, 0)[1])[0]
+    depths = np.asarray(raycast(built(b), inverted(pose[None]), K[None].astype(np.float32), HEIGHT, WIDTH, 0)[1])[0]
     # Rays that graze a silhouette may fall on either side of it.
     ok = np.abs(depths - wanted) <= DEPTH_TOLERANCE * wanted
     assert ok.mean() > 0.998

@@ -43,6 +43,7 @@ def with_terms(terms, kind="frame"):
     )
 
 
+WITH_K5 = edit_text("cameras.csv", lambda text: text.replace("k4", "k5").replace(",0,0,0\n", ",0.3,0,0\n"))
 TWO_MATRICES = b"1170 0 647 0\n0 1170 483 0\n0 0 1 0\n0 0 0 1\n"
 
 BAD = (
@@ -68,12 +69,7 @@ BAD = (
     ("Record3D", "skew", edit_json("metadata.json", K=[50, 0, 0, 5, 51, 0, 31, 25, 1]), "without skew"),
     ("cameras.json", "a lens", edit_json("cameras.json", k1=0.2), "[0].k1"),
     ("Polycam", "a lens", edit_json("keyframes/cameras/7001.json", distortion=[0.1, 0, 0, 0]), "distortion"),
-    (
-        "RealityCapture",
-        "k5",
-        edit_text("cameras.csv", lambda text: text.replace("k4", "k5").replace(",0,0,0\n", ",0.3,0,0\n")),
-        "k5",
-    ),
+    ("RealityCapture", "k5", WITH_K5, "k5"),
     ("Metashape", "p3", with_terms("<p3>1</p3>"), "p3"),
     ("Metashape", "b2", with_terms("<b2>3</b2>"), "b2"),
     ("Metashape", "a whole sphere", with_terms("", "spherical"), "perspective views"),

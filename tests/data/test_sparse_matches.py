@@ -3,23 +3,17 @@
 import numpy as np
 
 from ssplat_jax.data.sparse_matches import match, triangulate
-
-
-def two_cameras(rng, num_points=50):
-    angle = np.radians(5.0)
-    R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    t = np.array([0.3, -0.1, 0.05])
-    points = np.concatenate([rng.uniform(-1, 1, (num_points, 2)), rng.uniform(2, 5, (num_points, 1))], -1)
-    seen = points @ R.T + t
-    return points, points / points[:, 2:], seen / seen[:, 2:], R, t
+from tests.core.test_rotations import rodrigues
 
 
 def test_triangulation_inverts_projection():
-    points, rays_a, rays_b, R, t = two_cameras(np.random.default_rng(0))
-    inverse_depths, parallax = triangulate(rays_a, rays_b, R, t)
+    rng, R, t = np.random.default_rng(0), rodrigues([0, 1, 0], np.radians(5.0)), np.array([0.3, -0.1, 0.05])
+    points = np.concatenate([rng.uniform(-1, 1, (50, 2)), rng.uniform(2, 5, (50, 1))], -1)
+    seen = points @ R.T + t
+    inverse_depths, parallax = triangulate(points / points[:, 2:], seen / seen[:, 2:], R, t)
     np.testing.assert_allclose(1 / inverse_depths, points[:, 2], rtol=1e-10)
-    to_a, to_b = points, points + R.T @ t
-    cosine = (to_a * to_b).sum(-1) / np.linalg.norm(to_a, axis=-1) / np.linalg.norm(to_b, axis=-1)
+    to_b = points + R.T @ t
+    cosine = (points * to_b).sum(-1) / np.linalg.norm(points, axis=-1) / np.linalg.norm(to_b, axis=-1)
     np.testing.assert_allclose(parallax, np.degrees(np.arccos(cosine)), rtol=1e-6)
 
 

@@ -5,15 +5,12 @@ from importlib.metadata import entry_points
 import numpy as np
 import pytest
 from ssplat_experiments.accuracy_vs_time import mark_fronts
-from ssplat_experiments.depth_error import cell_depths, summary
-
-
-def row(ms, psnr):
-    return {"scene": "room", "ms_per_view": ms, "shown": psnr}
+from ssplat_experiments.depth_error import around_cells, near_edges, summary
 
 
 def test_the_front_holds_undominated_settings():
-    rows = [row(10, 15.0), row(20, 14.0), row(20, 18.0), row(5, 12.0), row(30, 18.0), row(40, 18.5)]
+    settings = ((10, 15.0), (20, 14.0), (20, 18.0), (5, 12.0), (30, 18.0), (40, 18.5))
+    rows = [{"scene": "room", "ms_per_view": ms, "shown": psnr} for ms, psnr in settings]
     mark_fronts(rows)
     for a in rows:
         beaten = any(b["ms_per_view"] <= a["ms_per_view"] and b["shown"] >= a["shown"] and b is not a for b in rows)
@@ -22,23 +19,23 @@ def test_the_front_holds_undominated_settings():
 
 def test_depth_errors_ignore_scale_and_are_binned():
     confidences = np.array([0.2, 0.55, 0.65, 0.95, 1.0])
-    row = summary(3.0 * np.array([2.0, 1.1, 1.0, 1.0, 1.02]), confidences, tau=0.5)
+    ratios, at_edges = 3.0 * np.array([2.0, 1.1, 1.0, 1.0, 1.02]), np.array([True, True, False, False, True])
+    around = np.stack([ratios, [3.0, np.nan, 3.06, 3.0, 3.2]], axis=-1)  # a second surface, or none, is near
+    row = summary(ratios, confidences, at_edges, around, tau=0.5)
     assert row["accepted"] == 0.8 and row["global_scale"] == pytest.approx(3.03)
     errors = [entry["median_error"] for entry in row["by_confidence"] if entry["tokens"]]
     np.testing.assert_allclose(errors, [0.9802, 0.0891, 0.0099, 0.0099], atol=1e-4)
     assert sum(entry["tokens"] for entry in row["by_confidence"]) == 5
-    row = summary(np.array([1.0, 1.0, 1.0, 1.2, 1.4]), np.array([0.3, 0.4, 0.5, 0.8, 0.9]), tau=0.0)
-    # Errors of the surest 1, 2, 4, 4 and 5 tokens.
-    found = {entry["share"]: entry["median_error"] for entry in row["by_share"]}
-    assert found == pytest.approx({0.25: 0.4, 0.5: 0.3, 0.75: 0.1, 0.85: 0.1, 1.0: 0.0})
+    assert (row["median_error_at_edges"], row["off_surfaces"]) == (pytest.approx(0.0495, abs=1e-4), 0.25)
 
 
-def test_a_cells_depth_is_the_median_of_its_known_depths():
-    depth = np.zeros((9, 8), np.float32)
-    depth[:4, :4] = np.arange(1, 17).reshape(4, 4)
-    depth[:2, 4:] = 5.0
-    depth[4, 4] = 7.0
-    np.testing.assert_array_equal(cell_depths(depth), [[8.0, 5.0], [0.0, 0.0]])
+def test_cells_are_near_an_edge_within_four_pixels_and_see_the_surfaces_around_them():
+    depth = np.full((8, 24), 2.0, np.float32)
+    depth[:, 12:] = 3.0
+    depth[:, 20:], depth[0, 23] = 0.0, 9.0  # an edge to what is not known is none
+    np.testing.assert_array_equal(near_edges(depth), [[False, True, True, True, True, False]] * 2)
+    seen = [set(np.unique(cell[np.isfinite(cell)])) for cell in around_cells(np.where(depth > 0, depth, np.nan))[1]]
+    assert seen == [{2.0}, {2.0}, {2.0, 3.0}, {2.0, 3.0}, {3.0, 9.0}, {3.0, 9.0}]
 
 
 def test_every_registered_experiment_and_benchmark_can_be_loaded():

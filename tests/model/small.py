@@ -129,11 +129,6 @@ def step(params, cache, chunk):
     return after, prediction.output
 
 
-def gradients(cache, chunk):
-    """The gradients of `program` with the random parameters."""
-    return program(params(), cache, chunk)[1]
-
-
 @functools.cache
 def warm_cache():
     """A cache after one chunk, so that there is a history to project."""
@@ -148,22 +143,16 @@ def turned(angle: float) -> jax.Array:
     return jnp.asarray(viewmats, jnp.float32)
 
 
-def with_gamma(raw_gamma: float) -> dict:
-    """Parameters with another gamma: softplus(-200) is 0, softplus(1e6) is 1e6."""
-    return params() | {"hpda": {"raw_gamma": jnp.float32(raw_gamma)}}
-
-
 def history(depths, confidences, feats=None, mask=None, colors=None) -> ProjectedCache:
     """A projected cache with given values; `mask` defaults to cells with a depth."""
-    depths, confidences = jnp.asarray(depths, jnp.float32), jnp.asarray(confidences, jnp.float32)
+    depths = jnp.asarray(depths, jnp.float32)
+    given = lambda x, channels: jnp.zeros((*depths.shape, channels)) if x is None else jnp.asarray(x, jnp.float32)  # noqa: E731
     return ProjectedCache(
         depths=depths,
-        confidences=confidences,
-        feats=jnp.zeros((*depths.shape, CONFIG.network.token_width))
-        if feats is None
-        else jnp.asarray(feats, jnp.float32),
+        confidences=jnp.asarray(confidences, jnp.float32),
+        feats=given(feats, CONFIG.network.token_width),
         mask=depths > 0 if mask is None else jnp.asarray(mask),
-        colors=jnp.zeros((*depths.shape, 3)) if colors is None else jnp.asarray(colors, jnp.float32),
+        colors=given(colors, 3),
     )
 
 

@@ -31,7 +31,7 @@ def scene(seed: int = 0):
     return rng.uniform(0.2, 0.55, (VIEWS, CELLS, CELLS, 3)), rng.uniform(1, 6, (VIEWS, CELLS, CELLS))
 
 
-def exposures(remembered, colors, depths, *, seen_depths=None, confidences=0.9, mask=None, valid=None):
+def exposures(remembered, colors, depths, *, seen_depths=None, confidences=0.9, mask=None, valid=(True,) * VIEWS):
     """Exposures estimated from the current `colors` of cells and their `remembered` ones."""
     seen_depths = depths if seen_depths is None else seen_depths
     images = np.repeat(np.repeat(colors, 4, axis=1), 4, axis=2)
@@ -39,8 +39,7 @@ def exposures(remembered, colors, depths, *, seen_depths=None, confidences=0.9, 
     with np.errstate(all="ignore"):
         log_depths = jnp.asarray(np.log(seen_depths), jnp.float32)
     trust = jnp.asarray(np.broadcast_to(confidences, depths.shape), jnp.float32)
-    valid = jnp.ones(VIEWS, bool) if valid is None else jnp.asarray(valid)
-    return np.asarray(estimate(known, log_depths, trust, jnp.asarray(images, jnp.float32), valid))
+    return np.asarray(estimate(known, log_depths, trust, jnp.asarray(images, jnp.float32), jnp.asarray(valid)))
 
 
 def oracle(remembered, colors, depths, seen_depths, confidences, mask):

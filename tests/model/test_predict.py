@@ -81,17 +81,18 @@ def test_hard_chunk_gives_finite_tokens_and_gradients(name):
 @pytest.mark.parametrize("name", HARD_MEMORIES)
 def test_hard_cache_gives_finite_tokens_and_gradients(name):
     cache, raw_gamma = HARD_MEMORIES[name]
-    check_prediction(small.chunk(), cache(), small.with_gamma(raw_gamma))
+    weights = small.params() | {"hpda": {"raw_gamma": jnp.float32(raw_gamma)}}  # softplus(1e6) is 1e6
+    check_prediction(small.chunk(), cache(), weights)
 
 
 def test_no_gradient_reaches_the_cache():
-    *_, remembered = small.gradients(small.warm_cache(), small.chunk())
+    _, (*_, remembered) = small.program(small.params(), small.warm_cache(), small.chunk())
     for gradient in remembered:
         np.testing.assert_array_equal(gradient, 0)
 
 
 def test_every_stage_gets_a_gradient():
-    by_params, *_ = small.gradients(small.warm_cache(), small.chunk())
+    _, (by_params, *_) = small.program(small.params(), small.warm_cache(), small.chunk())
     for stage in by_params.keys() - {"evidence"}:  # it is read from the cache, not from tokens
         gradient = by_params[stage]
         assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(gradient)) > 0, stage
@@ -108,4 +109,4 @@ def test_a_view_that_cannot_be_used_is_padding_and_counted():
     stats = replace(after.stats, num_unusable=wanted.stats.num_unusable)
     jax.tree.map(np.testing.assert_array_equal, replace(after, stats=stats), wanted)
     jax.tree.map(np.testing.assert_array_equal, output, expected)
-    assert small.finite(small.gradients(small.warm_cache(), spoiled))
+    assert small.finite(small.program(small.params(), small.warm_cache(), spoiled)[1])

@@ -27,7 +27,7 @@ from ssplat_jax.model.views import (
     patch_colors,
     prepare_views,
 )
-from tests.model.small import CONFIG, HEIGHT, MODEL, WIDTH, chunk, params, random_params
+from tests.model.small import CONFIG, HEIGHT, MODEL, WIDTH, chunk, params, random_params, side_by_side
 
 FLOAT32 = 1e-5
 prepared = jax.jit(lambda chunk: prepare_views(chunk, CONFIG))
@@ -126,20 +126,16 @@ def test_a_step_and_a_run_refuse_chunks_of_other_shapes():
         MODEL.run({}, MODEL.init_cache(), one)
 
 
-def line_of_cameras(*xs) -> jax.Array:
-    return jnp.stack([jnp.eye(4).at[0, 3].set(-float(x)) for x in xs])
-
-
 def test_sources_are_the_nearest_other_views_valid_ones_first():
-    sources, valid = SOURCES(line_of_cameras(0, 1, 3, 7), jnp.ones(4, bool), 2)
+    sources, valid = SOURCES(jnp.asarray(side_by_side([0, 1, 3, 7])), jnp.ones(4, bool), 2)
     np.testing.assert_array_equal(sources, [[1, 2], [0, 2], [1, 0], [2, 1]])
     assert valid.all()
-    sources, _ = SOURCES(line_of_cameras(0, 0, 0, 0), jnp.ones(4, bool), 3)  # at one center
+    sources, _ = SOURCES(jnp.asarray(side_by_side([0, 0, 0, 0])), jnp.ones(4, bool), 3)  # at one center
     assert [sorted(row) for row in np.asarray(sources).tolist()] == [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]
-    sources, valid = SOURCES(line_of_cameras(0, 0.1, 5, 9), jnp.array([True, False, True, True]), 3)
+    sources, valid = SOURCES(jnp.asarray(side_by_side([0, 0.1, 5, 9])), jnp.array([True, False, True, True]), 3)
     np.testing.assert_array_equal(sources[0], [2, 3, 1])
     np.testing.assert_array_equal(valid[0], [True, True, False])
-    alone, valid = SOURCES(line_of_cameras(0, 1), jnp.array([True, False]), 3)
+    alone, valid = SOURCES(jnp.asarray(side_by_side([0, 1])), jnp.array([True, False]), 3)
     assert alone.shape == (2, 1) and not valid[0].any() and int(alone[0, 0]) == 1
 
 

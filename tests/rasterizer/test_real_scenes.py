@@ -79,10 +79,7 @@ def test_tiles_equal_the_reference_in_float64(scenes):
         used = np.where((edge > BAND)[:, None], cotangent, 0)
         weigh = jax.jit(jax.grad(lambda inputs, part, ct: jnp.sum(at_pixels(inputs, part)[0] * ct)))
         parts = [weigh(doubles, p, jnp.asarray(c)) for p, c in zip(pixels, used.reshape(-1, AT_ONCE, 5), strict=True)]
-        exact = [
-            np.sum([np.asarray(leaf) for leaf in leaves], axis=0)
-            for leaves in zip(*map(jax.tree.leaves, parts), strict=True)
-        ]
+        exact = [sum(map(np.asarray, leaves)) for leaves in zip(*map(jax.tree.leaves, parts), strict=True)]
     outside = edge > BAND
     assert outside.mean() > 0.8
     got = np.concatenate([out.color, (out.depth * out.alpha)[..., None], out.alpha[..., None]], axis=-1)[rows, columns]

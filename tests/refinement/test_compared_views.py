@@ -71,10 +71,8 @@ def test_a_view_that_cannot_be_learned_from_is_left_out_and_no_other(name):
 
 def test_good_views_stay_and_so_do_duplicates():
     good = views()
-    twice = replace(
-        good, images=good.images.at[1].set(good.images[0]), viewmats=good.viewmats.at[1].set(good.viewmats[0])
-    )
-    for given in (good, twice):
+    copied = {name: getattr(good, name).at[1].set(getattr(good, name)[0]) for name in ("images", "viewmats")}
+    for given in (good, replace(good, **copied)):
         assert np.asarray(only_usable(doubtful(), given, MAX_PAIRS).valid).all()
 
 

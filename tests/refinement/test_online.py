@@ -13,7 +13,6 @@ from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.cache.state import Tokens, init_cache, with_refinement
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0
@@ -85,7 +84,7 @@ def tokens(seed: int = 0, behind: bool = False) -> Tokens:
 
 FUSE = jax.jit(fuse, static_argnums=2)
 _REVISE = jax.jit(functools.partial(online.refine_scene, MODEL))
-_DECODE = jax.jit(MODEL.decode)
+DECODE = jax.jit(MODEL.decode)
 _EMPTY = jax.jit(lambda: init_cache(CONFIG))
 _WITH_REFINEMENT = jax.jit(lambda cache: with_refinement(cache, CONFIG, HIGH, WIDE))
 _CELLS = jax.jit(lambda cache: voxel_indices(cache.means, cache.footprints, CONFIG)[0])
@@ -94,10 +93,6 @@ _CHANGE = jax.jit(lambda cache: unpack(cache.changes.reshape(-1, cache.changes.s
 
 def revise(cache, chunk, output):
     return _REVISE(params(), cache, chunk, output)
-
-
-def decode(cache):
-    return _DECODE(params(), cache)
 
 
 def start(*more: Tokens):
@@ -111,7 +106,7 @@ def start(*more: Tokens):
 def score(cache) -> float:
     """PSNR of a view that no chunk has shown."""
     view = chunk((0.05,))
-    color = render(decode(cache), view.camera, max_pairs=1 << 12).color
+    color = render(DECODE(params(), cache), view.camera, max_pairs=1 << 12).color
     return psnr(np.clip(np.asarray(color[0]), 0, 1), np.asarray(view.images[0]))
 
 
@@ -168,7 +163,7 @@ def test_any_key_views_leave_a_finite_bounded_scene(name):
     before = cache = start()
     for _ in range(4):
         cache = revise(cache, *ADVERSARIES[name])
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((decode(cache), cache.means, cache.changes)))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((DECODE(params(), cache), cache.means, cache.changes)))
     np.testing.assert_array_equal(_CELLS(cache), _CELLS(before))
     change = jax.tree.map(np.asarray, _CHANGE(cache))
     assert np.abs(change.means).max() <= CONFIG.memory.voxel_size
@@ -261,10 +256,8 @@ def test_a_session_refuses_half_of_a_request():
 def test_a_gaussian_follows_the_mean_of_its_views():
     """Two photographs of one place disagree: the color stays near their mean, whichever was shown last."""
     base = balls([[0.0, 0.0, 2.0]], 4.0, 0.98, 0.3)
-    K = jnp.array([[FOCAL, 0, WIDE / 2], [0, FOCAL, HIGH / 2], [0, 0, 1]])
     images = jnp.stack([jnp.full((HIGH, WIDE, 3), value) for value in (0.3, 0.7)])
-    views = KeyViews.of(Camera(viewmats=jnp.tile(jnp.eye(4), (2, 1, 1)), Ks=jnp.tile(K, (2, 1, 1)), width=WIDE,
-                               height=HIGH), images, None)  # fmt: skip
+    views = KeyViews.of(chunk((0.0, 0.0)).camera, images)
     zeros = no_change(base)
 
     def step(change, view):

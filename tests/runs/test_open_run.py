@@ -2,6 +2,7 @@
 
 import contextlib
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,9 +22,7 @@ from ssplat_jax.storage.chunk_records import load_chunk_records, save_chunk_reco
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
 from tests.data.capture_fixture import with_poses
-from tests.model.small import random_params
 from tests.runs.test_run_results import record
-from tests.streaming.narrow_model import FEW_GAUSSIANS
 
 CAPTURE, SIZE = "procedural:room?frames=8", (64, 48)
 QUIET = Reporter(quiet=True)
@@ -79,17 +78,19 @@ def test_saves_take_at_most_a_tenth_of_the_time(capture, tmp_path, monkeypatch):
     assert due == [130.0, 230.5, 388.0, 388.0]
 
 
-@pytest.mark.parametrize(("seconds", "every", "saved"), [(0.0, None, [4, 8]), (1e9, None, [8]), (1e9, 1, [4, 8])])
-def test_a_stream_is_saved_when_it_is_due_and_at_its_end(seconds, every, saved, tmp_path, monkeypatch, programs_shared):
-    monkeypatch.setattr(open_run, "SAVE_SECONDS", seconds)
-    monkeypatch.setattr(open_run, "SAVE_SHARE", np.inf)
-    monkeypatch.setattr(capture_run, "finish_run", lambda *given: 0)
-    done, save = [], open_run.save_state
-    monkeypatch.setattr(open_run, "save_state", lambda *given: done.append(given[2]["done"]) or save(*given))
-    options = Run("procedural:room?frames=8&size=64x48", tmp_path, save_every=every)
-    params = random_params(FEW_GAUSSIANS)
-    assert capture_run.run_capture(StreamSplat(FEW_GAUSSIANS), params, options, QUIET) == 0
-    assert done == saved
+@pytest.mark.parametrize(
+    ("next_save", "every", "saved"),
+    [(-np.inf, None, [4, 8]), (np.inf, None, []), (np.inf, 1, [4, 8]), (-np.inf, 2, [8])],
+)
+def test_a_stream_is_saved_when_it_is_due_and_at_its_end(next_save, every, saved, tmp_path, monkeypatch):
+    """Two chunks, known by the number of views after them, without a model; one save more comes at the end."""
+    for name in ("DeltaWriter", "record_chunk"):
+        monkeypatch.setattr(capture_run, name, Mock())
+    run, done = SimpleNamespace(num_views=0, next_save=next_save), []
+    run.take, run.save = lambda views: setattr(run, "num_views", views), lambda: done.append(run.num_views)
+    source = SimpleNamespace(total=8, chunks=lambda *given: [4, 8])
+    capture_run._stream.__wrapped__(run, source, Run(CAPTURE, tmp_path, save_every=every), QUIET)
+    assert done == [*saved, 8]
 
 
 def test_no_readable_state_suggests_overwrite(capture, tmp_path):

@@ -13,7 +13,6 @@ import pytest
 
 from ssplat_jax.cache.project import project
 from ssplat_jax.cache.state import VoxelCache, init_cache
-from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
 from tests.cache import streams
 from tests.cache.projection_scenes import front_camera, with_pivots
@@ -24,15 +23,14 @@ pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
 CACHE = streams.PAIRS  # a third token in a voxel merges
 ANY = CACHE.replace(min_confidence=0.0)
-EMPTY = init_cache(CACHE, streams.CAPACITY)
 # Without carving pivots of any confidence are seen, down to those whose square underflows.
 READ = jax.jit(functools.partial(project, config=CACHE.replace(carving=False)))
 IN_A_VOXEL = [[0.11, 0.10, 0.10], [0.12, 0.10, 0.10], [0.17, 0.10, 0.10]]
 
 
-def fused(tokens, config=CACHE, cache=EMPTY) -> VoxelCache:
-    """`cache` after `tokens`, checked to be finite and within its bounds."""
-    cache = streams.fuse(jax.tree.map(jnp.copy, cache), tokens, config)
+def fused(tokens, config=CACHE) -> VoxelCache:
+    """A cache after `tokens`, checked to be finite and within its bounds."""
+    cache = streams.fuse(init_cache(config, streams.CAPACITY), tokens, config)
     assert finite(cache)
     alive, confidences = np.asarray(cache.alive), np.asarray(cache.confidences)
     assert ((confidences >= 0) & (confidences <= 1)).all() and not confidences[~alive].any()
@@ -77,8 +75,8 @@ def test_hard_projection(name):
 
 def test_a_camera_far_from_the_origin_stays_finite():
     """At 6.4e6 float32 has a spacing of 0.5: depths are right to that, and tokens are counted as out of range."""
-    far, one = 6.4e6, front_camera()
-    camera = Camera(viewmats=jnp.eye(4).at[2, 3].set(-far)[None], Ks=one.Ks, width=one.width, height=one.height)
+    far = 6.4e6
+    camera = replace(front_camera(), viewmats=jnp.eye(4).at[2, 3].set(-far)[None])
     seen = READ(with_pivots([[0, 0, far + 4.0]]), camera)
     assert finite(seen) and seen.depths[0, 3, 4] == pytest.approx(4.0, abs=0.5)
     after = fused(tokens_at([[0, 0, far + 4.0]]))

@@ -35,6 +35,8 @@ MEAN = CONFIG.replace(depth_readout="mean")
 WINDOW = CONFIG.replace(depth_readout="window")
 READOUTS = {"mean": MEAN, "window": WINDOW}
 CANDIDATES = jnp.linspace(jnp.log(1.0), jnp.log(6.0), D)
+HUGE_LOGITS = 1e30 * jnp.eye(D)[3] * jnp.ones((*SHAPE, 1))
+SINGLE = {"logits": jnp.full((*SHAPE, 1), 3.0), "log_candidates": jnp.full(1, 0.7)}  # one candidate
 
 ANCHORS = {}  # name -> (changes to the ordinary inputs, check of the result)
 
@@ -95,20 +97,10 @@ anchor_case("matched at the far end", has_depth_of(D - 1), logits=sure(D - 1), r
 anchor_case("matcher sure: omega 1", has_matcher_confidence(lambda width: 1.0), logits=sure(4))
 anchor_case("matcher knows nothing", has_matcher_confidence(lambda width: width / D), logits=jnp.zeros((*SHAPE, D)))
 anchor_case("matcher sure, history elsewhere", logits=sure(2), confidences=1.0, at=9, raw_gamma=1e6)
-anchor_case(
-    "logits of 1e30", has_matcher_confidence(lambda width: 1.0), logits=1e30 * jnp.eye(D)[3] * jnp.ones((*SHAPE, 1))
-)
+anchor_case("logits of 1e30", has_matcher_confidence(lambda width: 1.0), logits=HUGE_LOGITS)
 anchor_case("near equals far", has_depth_of(0, FLOAT32), log_candidates=jnp.full(D, 0.7), at=2)
-anchor_case("one candidate", has_depth_of(0), logits=jnp.full((*SHAPE, 1), 3.0), log_candidates=jnp.full(1, 0.7))
-anchor_case(
-    "one candidate, history elsewhere",
-    has_depth_of(0),
-    logits=jnp.full((*SHAPE, 1), 3.0),
-    log_candidates=jnp.full(1, 0.7),
-    depths=5.0,
-    confidences=1.0,
-    raw_gamma=1e6,
-)
+anchor_case("one candidate", has_depth_of(0), **SINGLE)
+anchor_case("one candidate, history elsewhere", has_depth_of(0), **SINGLE, depths=5.0, confidences=1.0, raw_gamma=1e6)
 anchor_case("sigma in scene units", anchor="metric", confidences=1.0, at=5, raw_gamma=1e6)
 
 
@@ -242,9 +234,9 @@ HARD_LEARNED = {
     "all holes": {"depths": 0.0, "confidences": 0.0},
     "before the near end": {"depths": 1e-30},
     "beyond the far end": {"depths": 1e30},
-    "logits of 1e30": {"logits": 1e30 * jnp.eye(D)[3] * jnp.ones((*SHAPE, 1))},
+    "logits of 1e30": {"logits": HUGE_LOGITS},
     "near equals far": {"log_candidates": jnp.full(D, 0.7), "at": 2},
-    "one candidate": {"logits": jnp.full((*SHAPE, 1), 3.0), "log_candidates": jnp.full(1, 0.7), "depths": 5.0},
+    "one candidate": SINGLE | {"depths": 5.0},
 }
 
 

@@ -80,8 +80,3 @@ STREAM_PHASE = Phase(
     5e-4,
     warmup_steps=2,
 )
-
-
-def flat(tree) -> list[np.ndarray]:
-    """The leaves of a tree."""
-    return [np.asarray(x) for x in jax.tree.leaves(tree)]

@@ -15,7 +15,7 @@ import pytest
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.training import loop
 from ssplat_jax.training.recipe import AFTER_MATCHER, MATCHER, RECIPES, Recipe
-from tests.model.small import random_params
+from tests.model.small import finite, random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 from tests.training import problems
 
@@ -36,11 +36,9 @@ def formulas(recipe):
     x = {name: np.asarray(value, np.float64) for name, value in problems.flat_names(problems.start_params()).items()}
     mean, square, average = ({name: np.zeros(3) for name in x} for _ in range(3))
     steps = [(phase, place) for phase in recipe.phases for place in range(phase.steps)]
-    updates = 0
+    updates, start = 0, SimpleNamespace(seed=recipe.seed, params=problems.start_params())
     for step, (phase, place) in enumerate(steps):
-        start = SimpleNamespace(seed=recipe.seed, params=problems.start_params())
-        make = phase.samples.open(start)  # samples may depend on the first parameters
-        numbers = np.float64(make(step, place))
+        numbers = np.float64(phase.samples.open(start)(step, place))  # may depend on the first parameters
         learns = {name: name.split("'")[1] in phase.stages for name in x}
         gradients = {name: 2 * phase.loss.weight * (x[name] - numbers) * learns[name] for name in x}
         norm = math.sqrt(sum((gradient**2).sum() for gradient in gradients.values()))
@@ -109,10 +107,9 @@ def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
 def test_a_rendering_phase_moves_all_its_stages(tmp_path):
     params = random_params(NARROW)
     done = loop.train(NARROW, Recipe((problems.STREAM_PHASE,)), tmp_path, params=params)
-    assert done.step == 2 and all(np.isfinite(x).all() for x in problems.flat(done.params))
+    assert done.step == 2 and finite(done.params)
     for name in filter(params.get, done.state.params):
-        pairs = zip(problems.flat(params[name]), problems.flat(done.params[name]), strict=True)
-        assert any(not np.array_equal(a, b) for a, b in pairs), name
+        assert not jax.tree.all(jax.tree.map(np.array_equal, params[name], done.params[name])), name
 
 
 def test_recipes_that_the_configuration_or_the_samples_do_not_fit_are_refused(tmp_path):

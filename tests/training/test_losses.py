@@ -163,16 +163,11 @@ def test_the_anchor_learns_where_the_cache_is_right():
     matched[:, :, 0], truth[:, :, 0] = 2, num - 3  # the matcher errs most in the holes of the cache, below
     probs = np.exp(-0.5 * (np.arange(num) - matched[..., None]) ** 2)
     features = np.where(is_cache_right, 1.0, -1.0)[..., None] * np.ones(num_inputs(NARROW))
-    candidates = 0.1 * np.arange(num)
     floats = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    mask = jnp.ones(truth.shape, bool).at[:, :, 0].set(False)
     batch = AnchorSample(
-        inputs=AnchorInputs(
-            floats(features),
-            floats(probs / probs.sum(-1, keepdims=True)),
-            floats(cached),
-            jnp.ones(truth.shape, bool).at[:, :, 0].set(False),
-        ),
-        log_candidates=floats(np.stack([candidates] * 2)),
+        inputs=AnchorInputs(floats(features), floats(probs / probs.sum(-1, keepdims=True)), floats(cached), mask),
+        log_candidates=floats(np.tile(0.1 * np.arange(num), (2, 1))),
         log_depths=floats(0.1 * truth).at[:, :, :, 0].set(jnp.nan),
         usable=jnp.ones(truth.shape, bool),
     )

@@ -1,5 +1,6 @@
 """One browser: what it is sent for what a person chooses. Its client is a fake one."""
 
+import contextlib
 import dataclasses
 
 import jax.numpy as jnp
@@ -190,9 +191,8 @@ def test_a_run_of_other_poses_is_seen_from_its_own_start(tmp_path):
     folder, first = RunFolder(tmp_path), frame()
     restarted(folder, first)
     save_chunk_record(folder.chunk_record(2), record(1))
-    stage = Stage(open_source(tmp_path), max_gaussians=1000)
-    viewer, client = Viewer(stage, host="127.0.0.1", port=free_port()), FakeClient()
-    try:
+    stage, client = Stage(open_source(tmp_path), max_gaussians=1000), FakeClient()
+    with contextlib.closing(Viewer(stage, host="127.0.0.1", port=free_port())) as viewer:
         viewer.welcome(client)  # before there is a scene
         stage.refresh()
         viewer.update()
@@ -214,5 +214,3 @@ def test_a_run_of_other_poses_is_seen_from_its_own_start(tmp_path):
         assert stage.unit == pytest.approx(units[0] / 2) and stage.distance == pytest.approx(2 * units[1])
         assert sent.scale == pytest.approx(stage.unit / stage.distance) and sent.scale == pytest.approx(node.scale / 4)
         np.testing.assert_allclose(client.camera.position * stage.distance, [1.0, 2.0, 3.0])
-    finally:
-        viewer.close()

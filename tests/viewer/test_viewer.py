@@ -1,5 +1,6 @@
 """Scenes and pictures that browsers are sent, their sources, and the server."""
 
+import contextlib
 import functools
 import json
 import sys
@@ -202,13 +203,10 @@ def test_viser_and_an_address_that_cannot_be_used_are_refused_at_once(monkeypatc
 def test_the_server_answers_at_its_url_and_prints_nothing(tmp_path, capsys):
     pytest.importorskip("viser")
     ss.save_ply(tmp_path / "scene.ply", scene(0))
-    viewer = Viewer(opened(tmp_path), host="127.0.0.1", port=free_port())
-    try:
+    with contextlib.closing(Viewer(opened(tmp_path), host="127.0.0.1", port=free_port())) as viewer:
         assert viewer.url.startswith("http://localhost:")
         with urllib.request.urlopen(viewer.url, timeout=20) as page:
             assert page.status == 200
         viewer.update()
         assert not viewer.browsers
-    finally:
-        viewer.close()
     assert capsys.readouterr() == ("", "")

@@ -22,14 +22,7 @@ from ssplat_jax.core.errors import InputError, echo, reading, refusal
 from ssplat_jax.data.images import FisheyeLens, Lens
 from ssplat_jax.data.parsing import UNDISTORT, load_lines, parse_numbers
 from ssplat_jax.data.posed_image import Convention
-from ssplat_jax.data.readers.frame_list import (
-    FrameList,
-    Intrinsics,
-    Listing,
-    Reader,
-    images_folder,
-    images_in,
-)
+from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Listing, Reader, images_folder, images_in
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")  # places of a reconstruction, in the order of search
 MODELS = (  # name, parameters, and whether the camera is supported, by id
