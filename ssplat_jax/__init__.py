@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from ssplat_jax.poses.adjust_poses import adjust_poses as adjust_poses
     from ssplat_jax.rasterizer import Effects as Effects
     from ssplat_jax.rasterizer import RenderOutput as RenderOutput
+    from ssplat_jax.rasterizer import effects_for as effects_for
     from ssplat_jax.rasterizer import fill_holes as fill_holes
     from ssplat_jax.rasterizer import render as render
     from ssplat_jax.refinement import online_refinement as online_refinement
@@ -56,7 +57,7 @@ _MODULES = {
     "data.stream_frame": ("StreamFrame",),
     "model.streamsplat": ("StreamSplat",),
     "poses.adjust_poses": ("adjust_poses",),
-    "rasterizer": ("Effects", "RenderOutput", "fill_holes", "render"),
+    "rasterizer": ("Effects", "RenderOutput", "effects_for", "fill_holes", "render"),
     "refinement": ("online_refinement", "refine"),
     "scene_files.formats": ("load_ply", "load_scene", "save_ply", "save_spz"),
     "storage.weights": ("load_params",),

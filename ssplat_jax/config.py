@@ -275,7 +275,7 @@ class StreamConfig:
 
 PAPER = StreamConfig(
     preset="paper",
-    network=ResplatConfig(),
+    network=ResplatConfig(depth_range=None),
     history=HistoryConfig(hpda=True, cgfi=True),
     memory=MemoryConfig(voxel_size=0.04, carving=False, overflow="drop_new", capacity=1 << 18),
     head=HeadConfig(gaussians_per_token=1, sh_degree=3, evidence=False),
@@ -286,8 +286,10 @@ PAPER = StreamConfig(
 
 # Carving or unit norms on top of weights that were trained without them would change what the weights mean, so these
 # differ from `paper` only in what long captures and published weights need.
-SMALL = PAPER.replace(preset="small", depth_readout="mean", causal=False, overflow="grow", capacity=1 << 15)
-"""The paper's method for captures of any length, with depth read as the published networks read it."""
+PUBLISHED: dict[str, Any] = {"depth_range": ResplatConfig.depth_range, "depth_readout": "mean"}
+"""Fields with which ReSplat's weights were trained."""
+SMALL = PAPER.replace(preset="small", **PUBLISHED, causal=False, overflow="grow", capacity=1 << 15)
+"""The paper's method for captures of any length, with depth range and readout of the published networks."""
 
 PRESETS: dict[str, StreamConfig] = {
     "tiny": StreamConfig(),

@@ -73,13 +73,13 @@ def remembered(rng) -> ProjectedCache:
     )
 
 
-def test_frames_stream_in_their_order_in_the_units_of_the_poses():
+def test_frames_stream_in_their_order_in_the_units_of_the_poses_between_their_near_and_far():
     capture = smooth_capture(6, 32, 48)
     frame, order = capture.stream_frame(PAPER), [5, 2, 3, 1, 4]
     assert frame.scale == 1.0 and capture.stream_order(PAPER, order, frame) == order
     first = next(iter(capture.chunks(PAPER, order, stream_frame=frame)))
     candidates = np.exp(f64(jax.jit(lambda chunk: prepare_views(chunk, PAPER).log_candidates)(first)))
-    assert candidates[[0, -1]] == pytest.approx([0.01, 200.0], rel=1e-5)
+    assert candidates[[0, -1]] == pytest.approx(frame.depth_range, rel=1e-5)
 
 
 def test_anchor_fusion_mean_depth_and_both_confidences():

@@ -149,17 +149,12 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
     budget, captures = at_scale(BUDGETS, scale), None if scale == "smoke" else captures
     scenes = scenes_of(captures)
     asked = {name: value for name, value in dataclasses.asdict(budget).items() if name not in ("seeds", "trainings")}
+    asked["scenes"] = scenes
     return [
         Case(
             name=f"{variant}, seed {seed}",
             config=config_of(variant),
-            asked={
-                "seed": seed,
-                "scenes": scenes,
-                "learned": learned_from(captures),
-                "untrained": VARIANTS[variant].untrained,
-                **asked,
-            },
+            asked={"seed": seed, "learned": learned_from(captures), "untrained": VARIANTS[variant].untrained, **asked},
             measure=functools.partial(measured, variant, seed, budget, scenes, captures),
         )
         for variant, seed in trainings(budget)
@@ -199,11 +194,7 @@ def measured(variant: str, seed: int, budget: Budget, scenes: list[str], capture
 
 
 def trained(variant: str, config: StreamConfig, seed: int, budget: Budget, captures: Path | None) -> dict:
-    """Parameters of a variant after its training; one without an evidence head trains none.
-
-    Raises:
-        KeyboardInterrupt: a signal stopped it.
-    """
+    """Parameters of a variant after its training; one without an evidence head trains none."""
     shipped = load_params("tiny")
     start = complete_params(
         jax.random.key(seed), config, {stage: shipped[stage] for stage in MATCHER if stage in shipped}
@@ -223,7 +214,7 @@ def trained_by(config: StreamConfig, recipe: Recipe, params: dict, mix: CaptureM
         KeyboardInterrupt: a signal stopped it.
     """
     with tempfile.TemporaryDirectory() as folder:
-        lpips = installed_lpips() if any(phase.loss.renders for phase in recipe.phases) else None
+        lpips = installed_lpips() if recipe.uses_lpips else None
         done = train(config, recipe, Path(folder), params=params, mix=mix, lpips_weights=lpips)
     if done.interrupted:
         raise KeyboardInterrupt
@@ -273,7 +264,7 @@ def add_differences(rows: list[Row]) -> None:
 def findings(rows: list[Row]) -> list[str]:
     """Mean and standard deviation over seeds, by scene and variant."""
     difference = "full, same seed, minus it"
-    heads = ["scene", "variant", "shown PSNR dB", difference, "literal PSNR dB", difference, "Gaussians"]
+    heads = ["scene", "variant", "shown PSNR dB", difference, "literal PSNR dB", difference, "LPIPS", "Gaussians"]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for scene, variant in dict.fromkeys((row["scene"], row["variant"]) for row in rows):
         here = [row for row in rows if (row["scene"], row["variant"]) == (scene, variant)]
@@ -281,6 +272,8 @@ def findings(rows: list[Row]) -> list[str]:
         for column in COLUMNS:
             differences = [row[f"full_minus_it_{column}_db"] for row in here if f"full_minus_it_{column}_db" in row]
             cells += [spread([row[f"{column}_psnr"] for row in here]), spread(differences) if differences else ""]
+        lpips = [row.get("literal_lpips") for row in here]
+        cells.append("" if None in lpips else f"{statistics.mean(lpips):.3f}")
         cells.append(str(round(statistics.mean(row["gaussians"] for row in here))))
         lines.append("| " + " | ".join(cells) + " |")
     return ["\n".join(lines)]

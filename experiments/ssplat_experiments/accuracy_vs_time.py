@@ -5,11 +5,14 @@
 Every setting streams the same context views of `procedural:room` (and of redkitchen, where `--captures` has it) with
 the shipped weights, no retraining, and is scored on the same targets at the same size, whatever size it streamed at.
 Time is chunk in -> one novel view out on the full cache, warm. Writes `table.json`, `table.csv`, `page.md` and
-`plot.png`; what `--out` holds is not measured again. Needs an idle machine.
+`plot.png`; what `--out` holds is not measured again. A `table.json` of an earlier version that stands there as
+`earlier.json` is drawn too. Needs an idle machine.
 """
 
 import dataclasses
 import functools
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,42 +40,34 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     """Measures every setting on every available scene; `smoke` takes one."""
     if captures is None or not (captures / REDKITCHEN).is_dir():
         reporter.warn("no redkitchen under --captures: the procedural scene stands alone")
-    return run_study(STUDY, captures, out, scale, reporter)
+    path = out / "earlier.json"
+    earlier = json.loads(path.read_text()) if path.exists() else []
+    study = dataclasses.replace(STUDY, plot=functools.partial(plot, earlier=earlier))
+    return run_study(study, captures, out, scale, reporter)
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
     """A case for every setting and scene, then one for every size and scene whose stream is refined."""
     sizes = at_scale(SIZES, scale)
+    groups = [[setting] for setting in SETTINGS[: sizes.settings]]
+    if sizes.settings is None:
+        groups += [[setting for setting in REFINED if setting.factor == factor] for factor in REFINED_FACTORS]
     asked = {**dataclasses.asdict(sizes), "settings": None}
-    scenes = _scenes(captures, sizes.context)
-    found = [
+    return [
         Case(
-            name=f"{scene}, {setting.name}",
-            config=config_of(setting, sizes),
-            asked={"scene": scene, "factor": setting.factor, **asked},
-            measure=functools.partial(_measured, scene, [setting], sizes, opened),
+            name=f"{scene}, {group[-1].name}",
+            config=config_of(group[0], sizes),
+            asked={"scene": scene, "factor": group[0].factor, "steps": [s.refine_steps for s in group], **asked},
+            measure=functools.partial(_measured, scene, group, sizes, opened),
         )
-        for setting in SETTINGS[: sizes.settings]
-        for scene, opened in scenes.items()
+        for group in groups
+        for scene, opened in _scenes(captures, sizes.context).items()
     ]
-    for factor in REFINED_FACTORS if sizes.settings is None else ():
-        settings = [setting for setting in REFINED if setting.factor == factor]
-        found += [
-            Case(
-                name=f"{scene}, size x {factor:g}, refined",
-                config=config_of(settings[0], sizes),
-                asked={"scene": scene, "factor": factor, "steps": [s.refine_steps for s in settings], **asked},
-                measure=functools.partial(_measured, scene, settings, sizes, opened),
-            )
-            for scene, opened in scenes.items()
-        ]
-    return found
 
 
 def _measured(scene: str, settings: list[Setting], sizes: Sizes, opened: Opened) -> list[Row]:
-    rows = (
-        measure_refined(settings, sizes, opened) if settings[0].refine_steps else [measure(settings[0], sizes, opened)]
-    )
+    first = settings[0]
+    rows = measure_refined(settings, sizes, opened) if first.refine_steps else [measure(first, sizes, opened)]
     return [{"scene": scene} | row for row in rows]
 
 
@@ -93,8 +88,8 @@ def mark_fronts(rows: list[Row]) -> None:
         best[row["scene"]] = max(best.get(row["scene"], -np.inf), row["shown"])
 
 
-def plot(pyplot: Any, rows: list[Row]) -> Any:
-    """A panel per scene: the front as a line, the qualities named, refined scenes as triangles."""
+def plot(pyplot: Any, rows: list[Row], earlier: Sequence[Row] = ()) -> Any:
+    """A panel a scene: the front as a line, qualities named, refined scenes as triangles, an earlier version gray."""
     quality = {setting.name: setting.quality for setting in (*SETTINGS, *REFINED) if setting.quality}
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, panels = pyplot.subplots(1, len(scenes), figsize=(7 * len(scenes), 5), layout="constrained", squeeze=False)
@@ -107,6 +102,10 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
             axes.scatter(*at, s=60 if name else 22, marker="^" if "refine_s" in row else "o", color="#30507a", zorder=2)
             if name:
                 axes.annotate(name, at, textcoords="offset points", xytext=(6, -10), fontsize=9, weight="bold")
+        for row in (row for row in earlier if row["scene"] == scene):
+            at, marker = (row["ms_per_view"], row["shown"]), "^" if "refine_s" in row else "o"
+            axes.scatter(*at, s=60, marker=marker, color="#909090", zorder=2)
+            axes.annotate(row["commit"], at, textcoords="offset points", xytext=(6, -10), fontsize=8, color="#606060")
         axes.set_xscale("log")
         axes.set_xlabel("ms per view, chunk in to novel view out, refinement spread over the views")
         axes.set_title(scene)

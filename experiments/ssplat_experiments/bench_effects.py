@@ -46,6 +46,7 @@ def _sparse(opacity: float) -> Scene:
 
 LENS = jnp.array([-0.2, 0.05, 0.002, -0.003, 0.01])
 GAINS = jnp.array([[1.2, 0.0, 0.0, 0.01], [0.0, 0.9, 0.0, 0.0], [0.0, 0.0, 1.1, -0.02]])
+EQUAL = jnp.eye(3, 4)
 BASE = Effects(sh_degree=0, antialias="none", outputs=("color",))
 
 
@@ -69,12 +70,7 @@ ROWS = (
         lambda: _plain(distortion=LENS),
         lambda: _plain(distortion=0 * LENS),
     ),
-    Row(
-        "exposure",
-        BASE.replace(exposure=True),
-        lambda: _plain(exposures=GAINS),
-        lambda: _plain(exposures=jnp.eye(3, 4)),
-    ),
+    Row("exposure", BASE.replace(exposure=True), lambda: _plain(exposures=GAINS), lambda: _plain(exposures=EQUAL)),
     Row("background", BASE.replace(background=(1.0, 1.0, 1.0)), lambda: _sparse(0.01), lambda: _sparse(0.9)),
     Row("alpha", BASE.replace(outputs=("color", "alpha")), _plain, _plain),
     Row("depth (with alpha)", BASE.replace(outputs=("color", "alpha", "depth")), _plain, _plain),

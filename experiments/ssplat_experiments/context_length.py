@@ -12,9 +12,11 @@ of our scene, a memory that keeps every token, and the same network over all vie
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ssplat_experiments.baselines import JointNetwork, baseline_scores, joint_config, one_chunk
 from ssplat_experiments.cases import PICTURE, Case, Row
@@ -58,6 +60,8 @@ SIZES = {
         Sizes((24, 64, 128), WALKS, (160, 120), joint=64),
         Sizes((24, 256, 512, 1024), ("room",), (96, 72), joint=0, label=", 96 x 72"),
         Sizes((256, 1024, 4096), ("room",), (96, 72), joint=0, label=", slow, 96 x 72"),
+        Sizes((1024, 4096, 10_000), ("laps",), (96, 72), joint=0, label=", 96 x 72"),
+        Sizes((64, 256, 512, 984), (), (160, 120), joint=0, label=", all frames"),  # captures of 1,000 frames or more
     ),
     "gpu": (
         Sizes((24, 64, 128), WALKS, (480, 256)),
@@ -107,15 +111,33 @@ def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
 
 def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list[Row]:
     """A row for each number of views; with our memory, one for each image baseline too."""
+    found = _stream(path, method, config, sizes)
+    return until_full(found, sizes.counts, {"suite": _suite(path) + sizes.label, "method": method})
+
+
+def until_full(found: Iterator[list[Row]], counts: Sequence[int], place: Row) -> list[Row]:
+    """Rows of each number of views; the first that does not fit is `OOM`, and nothing larger is tried."""
+    rows: list[Row] = []
+    for count in counts:
+        here = place | {"views": count}
+        try:
+            rows += [here | row for row in next(found)]
+        except RuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            return [*rows, here | {"peak_memory_bytes": OOM}]
+    return rows
+
+
+def _stream(path: str, method: str, config: StreamConfig, sizes: Sizes) -> Iterator[list[Row]]:
     capture, split, stream_frame = _opened(path, config, sizes)
-    session, exposures, rows = new_session(config), {}, []
+    session, exposures = new_session(config), {}
     middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
     for fed, count in itertools.pairwise((0, *sizes.counts)):
         found, recent = feed_capture(session, capture, split.context[fed:count], stream_frame, num_recent=NUM_TIMED)
         exposures |= found
-        place = {"suite": _suite(path) + sizes.label, "views": count}
         seen = split.context[:count] if method == OURS else ()
-        scored = _scores(session.gaussians(), capture, split.targets, stream_frame, exposures, seen)
+        scored, color = _scores(session.gaussians(), capture, split.targets, stream_frame, exposures, seen)
         memory, latency = peak_memory(session, middle), measure_latency(session, recent, middle)
         cost = {
             "step_ms": latency["step_ms"],
@@ -123,28 +145,14 @@ def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list
             "gaussians": session.cache_facts()["decoded"],
             **memory,
         }
-        for name, scores in scored.items():
-            rows.append({**place, "method": name, **scores} | (cost if name == "scene" else {}))
-            rows[-1]["method"] = method if name == "scene" else name
-        if method == OURS:
-            view = score_view(
-                session.gaussians(), capture, split.targets[len(split.targets) // 2], stream_frame, exposures
-            )
-            rows[-len(scored)][PICTURE] = view.color
-    return rows
+        row = scored.pop("scene") | cost | ({PICTURE: color} if method == OURS else {})
+        yield [row, *({"method": name, **scores} for name, scores in scored.items())]
 
 
 def measured_joint(path: str, counts: Sequence[int], config: StreamConfig, sizes: Sizes) -> list[Row]:
-    """Rows of the joint network; the first number of views that does not fit is `OOM`, and nothing larger is tried."""
-    place, rows = {"suite": _suite(path) + sizes.label, "method": JOINT}, []
-    for count in counts:
-        try:
-            rows.append(place | {"views": count} | joint_row(path, count, config, sizes))
-        except RuntimeError as error:
-            if "RESOURCE_EXHAUSTED" not in str(error):
-                raise
-            return [*rows, place | {"views": count, "peak_memory_bytes": OOM}]
-    return rows
+    """A row of the joint network for each number of views."""
+    found = ([joint_row(path, count, config, sizes)] for count in counts)
+    return until_full(found, counts, {"suite": _suite(path) + sizes.label, "method": JOINT})
 
 
 def joint_row(path: str, count: int, config: StreamConfig, sizes: Sizes) -> Row:
@@ -153,7 +161,7 @@ def joint_row(path: str, count: int, config: StreamConfig, sizes: Sizes) -> Row:
     chunk = one_chunk(list(capture.chunks(config, split.context[:count], stream_frame=stream_frame)))
     network = JointNetwork(config, load_params("tiny"), chunk)
     gaussians = network.gaussians()
-    scored = _scores(gaussians, capture, split.targets, stream_frame, {}, ())["scene"]
+    scored = _scores(gaussians, capture, split.targets, stream_frame, {}, ())[0]["scene"]
     middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
     cost = {"gaussians": int((gaussians.opacities > 0).sum()), **network.peak_memory(middle)}
     return {**scored, **cost}
@@ -177,16 +185,18 @@ def _scores(
     stream_frame: StreamFrame,
     exposures: Exposures,
     context: Sequence[int],
-) -> dict[str, dict[str, float | None]]:
-    """Mean scores of the scene and, for the views of a context, of the image baselines, by their names."""
+) -> tuple[dict[str, dict[str, float | None]], np.ndarray]:
+    """Mean scores of the scene and, with a context, of the image baselines, by name; and the middle target as shown."""
     found: dict[str, list[dict[str, ImageScore]]] = {"scene": []}
+    colors = []
     for i in targets:
         view = score_view(gaussians, capture, i, stream_frame, exposures, installed_lpips())
+        colors.append(view.color)
         found["scene"].append({"literal": view.score.literal, "shown": view.score.shown})
         if context:
             for name, scores in baseline_scores(capture, i, context, stream_frame, view.depth, exposures).items():
                 found.setdefault(name, []).append(scores)
-    return {
+    means = {
         name: {
             f"{column}_{metric}": value
             for column in ("literal", "shown")
@@ -194,6 +204,7 @@ def _scores(
         }
         for name, scores in found.items()
     }
+    return means, colors[len(colors) // 2]
 
 
 def plot(pyplot: Any, rows: list[Row]) -> Any:
@@ -201,7 +212,7 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
     figure, panels = pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")
     for color, suite in enumerate(dict.fromkeys(row["suite"] for row in rows)):
         for method, style in ((OURS, "o-"), (APPEND, "s--")):
-            here = [row for row in rows if (row["suite"], row["method"]) == (suite, method)]
+            here = [row for row in rows if (row["suite"], row["method"]) == (suite, method) and "literal_psnr" in row]
             views = [row["views"] for row in here]
             panels[0].plot(views, [row["peak_memory_bytes"] / 2**20 for row in here], style, color=f"C{color}")
             label = f"{suite}, {method}"

@@ -122,7 +122,7 @@ def summary(
     accepted = confidences >= tau
     scale = float(np.median(ratios[accepted]))
     errors = np.abs(ratios / scale - 1.0)
-    median = lambda kept: round(float(np.median(errors[kept])), 4) if kept.any() else None  # noqa: E731
+    median = lambda kept: round(float(np.median(errors[kept])), 4) if kept.any() else np.nan  # noqa: E731
     bins = []
     for low, high in itertools.pairwise(BIN_EDGES):
         inside = (confidences >= low) & ((confidences < high) | (high == BIN_EDGES[-1]))

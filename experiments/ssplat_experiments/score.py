@@ -3,11 +3,11 @@
     ssplat experiment score --captures path/to/capture --renders path/to/renders --out runs/score
 
 The folder of renders holds `split.json`, as `ssplat eval` writes it, and one image for each target, named by its frame:
-`00004.png`. All images have one size, at which the capture is read. Scores are literal: the pixels as they are, no
-holes filled and no exposure changed. The nearest context view and the mean color stand beside them. The row shows the
-`peak_memory_bytes` of `metrics.json`, as `ssplat eval` writes it, where the folder holds one; "OOM" there stands for a
-method that had no memory for the scene, and needs no images. Of many scenes both folders hold one folder for each, and
-the means over views, then scenes, come last.
+`00004.png`, or `000004.png` as pixelSplat and its heirs write it. All images have one size, at which the capture is
+read. Scores are literal: the pixels as they are, no holes filled and no exposure changed. The nearest context view and
+the mean color stand beside them. The row shows the `peak_memory_bytes` of `metrics.json`, as `ssplat eval` writes it,
+where the folder holds one; "OOM" there stands for a method that had no memory for the scene, and needs no images. Of
+many scenes both folders hold one folder for each, and the means over views, then scenes, come last.
 """
 
 import functools
@@ -159,7 +159,9 @@ def read_memory(path: Path) -> int | str | None:
 
 def _file_of(folder: Path, i: int) -> Path:
     """The image of a target."""
-    found = [path for suffix in SUFFIXES if (path := folder / f"{i:05d}{suffix}").is_file()]
+    found = [
+        path for end in SUFFIXES for name in (f"{i:05d}", f"{i:06d}") if (path := folder / f"{name}{end}").is_file()
+    ]
     if len(found) != 1:
         got = "none" if not found else " and ".join(path.name for path in found)
         raise InputError(f"{folder}: wanted one image {i:05d}.png of target {i}, got {got}.")

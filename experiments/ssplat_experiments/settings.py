@@ -11,6 +11,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
+from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, key_views_of
@@ -103,13 +104,11 @@ class _Streamed:
 
     def row(self, setting: Setting, gaussians: Gaussians) -> dict[str, Any]:
         """A row of the table, with the scores of `gaussians`."""
-        scores = score_targets(gaussians, self.scored, self.split.targets, self.stream_frame, self.exposures)
-        return {
-            "setting": setting.name,
-            "shown": round(scores["shown"]["psnr"], 3),
-            "literal": round(scores["literal"]["psnr"], 3),
-            **self.cost,
-        }
+        given = (self.scored, self.split.targets, self.stream_frame, self.exposures, installed_lpips())
+        scores = score_targets(gaussians, *given)
+        row = {"setting": setting.name} | {kind: round(scores[kind]["psnr"], 3) for kind in ("shown", "literal")}
+        row |= {f"{kind}_{name}": scores[kind][name] for kind in ("shown", "literal") for name in ("ssim", "lpips")}
+        return row | self.cost
 
 
 def measure(setting: Setting, sizes: Sizes, opened: Opened) -> dict[str, Any]:

@@ -35,11 +35,11 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     """Opens the capture at `path`.
 
     Args:
-        path: a folder or file in one of the formats of `data.readers`, or a procedural scene (room, orbit, corridor,
-            revisit), such as `procedural:room?frames=73&size=128x96&seed=0`. Poses that do not follow the convention of
-            their format are read with options behind it: `folder?axes=opengl&poses=world-to-camera`. Depth maps of a
-            folder are streamed with its images, unless `folder?depth=off` says no; those of a procedural scene are
-            exact, and are streamed only with `depth=on`.
+        path: a folder or file in one of the formats of `data.readers`, or a procedural scene (room, laps, orbit,
+            corridor, revisit), such as `procedural:room?frames=73&size=128x96&seed=0`. Poses that do not follow the
+            convention of their format are read with options behind it: `folder?axes=opengl&poses=world-to-camera`.
+            Depth maps of a folder are streamed with its images, unless `folder?depth=off` says no; those of a
+            procedural scene are exact, and are streamed only with `depth=on`.
         size: (width, height) of delivered images. Stored images are scaled to cover it and cropped at the center, and
             the intrinsics follow exactly. By default the size of the stored images.
 

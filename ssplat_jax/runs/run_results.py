@@ -207,6 +207,7 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
     facts = [
         ("PSNR as shown", f"{shown['psnr']:.2f} dB"),
         ("SSIM as shown", f"{shown['ssim']:.3f}"),
+        *([] if shown["lpips"] is None else [("LPIPS as shown", f"{shown['lpips']:.3f}")]),
         ("PSNR, literal", f"{literal['psnr']:.2f} dB"),
         ("PSNR of copying the nearest view", f"{metrics['baselines']['nearest_view_psnr']:.2f} dB"),
         ("a chunk, median", f"{metrics['chunk_ms']['median']:.0f} ms"),

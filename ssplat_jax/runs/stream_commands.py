@@ -321,10 +321,13 @@ class Eval(StreamOptions):
 
 
 def _both_scores(scores: dict) -> str:
-    """PSNR and SSIM in words: of the image that is shown, then literal."""
-    return ", ".join(
-        f"{name} {scores[name]['psnr']:.2f} dB {scores[name]['ssim']:.3f}" for name in ("shown", "literal")
-    )
+    """PSNR, SSIM and, where its weights are installed, LPIPS: of the image that is shown, then literal."""
+    words = []
+    for name in ("shown", "literal"):
+        score = scores[name]
+        lpips = "" if score["lpips"] is None else f" LPIPS {score['lpips']:.3f}"
+        words.append(f"{name} {score['psnr']:.2f} dB SSIM {score['ssim']:.3f}{lpips}")
+    return ", ".join(words)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,7 +25,7 @@ import numpy as np
 from flax import traverse_util
 from jax.flatten_util import ravel_pytree
 
-from ssplat_jax.config import PRESETS, StreamConfig, preset
+from ssplat_jax.config import PRESETS, PUBLISHED, StreamConfig, preset
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.model.network import init_params, stages_of
 from ssplat_jax.storage.files import load_arrays, read_tensors, save_arrays
@@ -256,9 +256,10 @@ def published_tensors(config: StreamConfig) -> dict[str, PublishedTensor | None]
 def as_published(config: StreamConfig) -> StreamConfig:
     """`config` with the behavior of the code that the published weights were trained with.
 
-    That code reads depth in the space of the candidates (`depth_readout="mean"`), where the paper prints metric depths.
+    That code has one range of depths, and reads depth in the space of the candidates (`depth_readout="mean"`), where
+    the paper prints metric depths.
     """
-    return config.replace(upstream_compat=True, depth_readout="mean")
+    return config.replace(upstream_compat=True, **PUBLISHED)
 
 
 def import_params(path: Path, config: StreamConfig, *, depth_only: bool = False) -> ImportedParams:

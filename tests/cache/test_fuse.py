@@ -86,6 +86,12 @@ def test_pivots_are_bounded_inside_their_voxels_findable_and_counted(stream):
     assert stats.num_seen == sum(r.num_valid for r in stream) == stats.num_accepted + left_out
 
 
+def test_a_token_without_a_positive_footprint_is_left_out_and_counted():
+    cache = fused(streams.tokens_at([[0.1, 0.1, 0.1]] * 5, footprints=jnp.array([-0.3, 0.0, jnp.nan, jnp.inf, 0.3])))
+    assert (int(cache.stats.num_non_finite), int(cache.stats.num_accepted)) == (4, 1)
+    np.testing.assert_allclose(np.asarray(cache.footprints)[np.asarray(cache.alive)], 0.3)
+
+
 @SETTINGS
 @given(st.lists(streams.recipes, min_size=1, max_size=3), st.integers(1, streams.NUM_TOKENS - 1))
 def test_splitting_a_chunk_changes_nothing(stream, at):

@@ -8,10 +8,13 @@ from PIL import Image
 import ssplat_jax as ss
 from ssplat_jax.core.gaussians import mean_color
 from ssplat_jax.data.capture import Capture
+from ssplat_jax.evaluation import scoring
 from ssplat_jax.rasterizer import Effects, fill_holes
+from ssplat_jax.runs import scene_outputs
 from ssplat_jax.runs.open_run import save_poses
 from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.viewer import stage
 from tests.commands.command_fixture import make_capture, run
 from tests.data.capture_fixture import with_poses
 
@@ -88,6 +91,25 @@ def test_a_scene_of_any_format_is_drawn_with_the_filter_that_it_names(tmp_path, 
     np.testing.assert_allclose(found, wanted(capture, loaded, 0, antialias), atol=0.51 * LEVEL)
     if name == "scene.ply":
         assert np.abs(found - wanted(capture, loaded, 0, "mip")).max() > 3 * LEVEL
+
+
+def test_pictures_scores_and_the_viewer_draw_only_what_a_scene_calls_for(tmp_path, capture, monkeypatch):
+    """A scene of degree 3 whose bands are empty is drawn with none."""
+    degrees, opened = [], ss.open_capture(capture)
+    splats = ss.Gaussians(**vars(scene()) | {"sh": jnp.zeros((60, 16, 3)).at[:, :1].set(scene().sh)})
+
+    def drawn(scene, camera, *, effects):
+        degrees.append(effects.sh_degree)
+        return ss.render(scene, camera, effects=effects)
+
+    for module in (scene_outputs, scoring, stage):
+        monkeypatch.setattr(module, "render", drawn)
+    ss.save_ply(tmp_path / "scene.ply", splats)
+    assert run("render", tmp_path / "scene.ply", capture, "--max-views", "1", "--out", tmp_path / "out", "--quiet") == 0
+    stream_frame = opened.stream_frame(ss.preset("tiny"))
+    scoring.score_view(splats, opened, 0, stream_frame, {})
+    stage.draw(splats, "color", opened.frames[0].camtoworld, opened.K(0), (48, 32))
+    assert degrees == [0, 0, 0]
 
 
 def test_a_film_goes_from_camera_to_camera(tmp_path, capture):

@@ -101,6 +101,15 @@ def test_revisit_returns_to_places_that_it_saw_and_hardly_moves_there():
     assert np.median(np.abs(images[31] - images[30])) > 0.005, "nearly one pose; they differ by noise"
 
 
+def test_laps_walk_the_path_of_the_room_again_and_again():
+    (_, depths, poses, _), (_, once, path, _) = (
+        procedural_capture_arrays(name, frames, 24, 32) for name, frames in (("laps", 97), ("room", 10))
+    )
+    again = np.arange(97) % 10
+    np.testing.assert_allclose(poses, path[again], atol=1e-5)
+    np.testing.assert_allclose(np.median(depths - once[again], axis=(1, 2)), 0, atol=1e-4)
+
+
 def test_fading_keeps_the_scene_or_takes_all_texture_away():
     scene = sample_scene(3, "room")
     np.testing.assert_array_equal(fade_scene(scene, 1.0).faces, scene.faces)

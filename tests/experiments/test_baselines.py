@@ -4,7 +4,9 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from ssplat_experiments.baselines import baseline_scores, warp
+from ssplat_experiments.context_length import until_full
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.cameras import Camera
@@ -44,3 +46,18 @@ def test_baselines_do_not_see_the_target():
     mean = np.mean([room.image(j).mean(axis=(0, 1)) for j in context], axis=0)
     expected = -10 * np.log10(np.mean(mean**2))  # of the mean color against black
     assert abs(unseen.psnr - expected) < 1e-3 and seen.psnr != unseen.psnr
+
+
+def test_the_first_number_of_views_without_memory_is_a_row_and_nothing_larger_is_tried():
+    def rows(error, tried):
+        for count in (2, 4, 8):
+            tried.append(count)
+            if count == 4:
+                raise RuntimeError(error)
+            yield [{"literal_psnr": 9.0}]
+
+    found = until_full(rows("RESOURCE_EXHAUSTED: 9 GiB", tried := []), (2, 4, 8), {"suite": "room"})
+    fits, full = {"views": 2, "literal_psnr": 9.0}, {"views": 4, "peak_memory_bytes": "OOM"}
+    assert found == [{"suite": "room", **row} for row in (fits, full)] and tried == [2, 4]
+    with pytest.raises(RuntimeError, match="INTERNAL"):
+        until_full(rows("INTERNAL", []), (2, 4, 8), {})

@@ -18,11 +18,12 @@ QUIET = Reporter(quiet=True)
 
 
 def write_renders(folder, room, split, gain=1.0):
-    """The targets of a split, darker than they are by a gain."""
+    """The targets of a split, darker than they are by a gain; names have six digits, of darker ones five."""
     folder.mkdir(parents=True)
     (folder / "split.json").write_text(split.to_json())
     for i in split.targets:
-        Image.fromarray((room.image(i) * gain * 255).round().astype(np.uint8)).save(folder / f"{i:05d}.png")
+        name = f"{i:06d}.png" if gain == 1.0 else f"{i:05d}.png"
+        Image.fromarray((room.image(i) * gain * 255).round().astype(np.uint8)).save(folder / name)
 
 
 def test_renders_are_scored_as_they_are(tmp_path):

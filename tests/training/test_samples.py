@@ -64,6 +64,13 @@ def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
     assert max(shares) > 0.1
 
 
+def test_captures_are_told_apart_without_reading_an_image(tmp_path, monkeypatch):
+    found = mix_of(open_capture(make_capture(tmp_path / "a")))
+    monkeypatch.setattr("builtins.open", None)
+    monkeypatch.setattr("io.open", None)
+    assert found.describe()[0][2] == mix_of(found.captures[0]).describe()[0][2]
+
+
 def test_true_depth_of_a_cell_is_that_at_its_center():
     # A plane in log depth: a cell's center is the common corner of its pixels 1 and 2, at (2, 2).
     y, x = np.mgrid[0:8, 0:12] + 0.5

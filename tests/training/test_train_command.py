@@ -155,7 +155,7 @@ def started(monkeypatch):
     draw_with_numpy(monkeypatch)
 
     def ends_at_once(config, recipe, out, *, params, **others):
-        seen.update(config=config, params=params)
+        seen.update(config=config, params=params, lpips_weights=others["lpips_weights"])
         out.mkdir(exist_ok=True)
         return SimpleNamespace(params=params, step=1, interrupted=None)
 
@@ -184,6 +184,13 @@ def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, sta
     untrained, shipped = init_params(jax.random.key(3), started["config"], ["cgfi"]), load_params("tiny")
     for name, stage in started["params"].items():
         assert_same_bits(stage, (untrained if name == "cgfi" else shipped)[name])
+
+
+def test_losses_with_a_term_of_lpips_get_its_weights_where_they_are_installed(tmp_path, started, monkeypatch):
+    monkeypatch.setattr("ssplat_jax.evaluation.metrics.installed_lpips", lambda: "weights")
+    for name, given in (("stream", "weights"), ("evidence", "weights"), ("depth", None)):
+        Train(out=tmp_path / name, recipe=name, init_weights=SHIPPED).run()
+        assert started["lpips_weights"] == given
 
 
 def test_the_head_that_the_weights_have_does_not_matter(tmp_path, started):

@@ -140,7 +140,8 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
 
     `room`, `orbit` and `corridor` are smooth paths that cover their world evenly. `revisit` has weak textures, noise
     and a path that returns: half of its views go around a room, then the camera stands at four places, closer to what
-    it saw before, and hardly moves. Another `seed` selects another world of the same kind.
+    it saw before, and hardly moves. `laps` walks the path of `room` again and again. Another `seed` selects another
+    world of the same kind.
     """
     if name not in CAPTURES:
         options = "with the options ?frames=73&size=128x96&seed=0&depth=on"
@@ -164,7 +165,7 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
 
 
 def _around_room(scene: Scene, s: float) -> np.ndarray:
-    """Pose at `s` in [0, 1] on a circle around the middle of a room, looking across it."""
+    """Pose after `s` laps on a circle around the middle of a room, looking across it."""
     angle = 2 * np.pi * s
     position = np.array([0.5 * np.sin(angle), -1.4 + 0.15 * np.sin(3 * angle), 0.5 * np.cos(angle)])
     return look_at(position, np.array([-np.sin(angle), -1.15, -np.cos(angle)]))
@@ -211,8 +212,11 @@ class _Route:
     noise: float = 0.0  # standard deviation of a pixel's noise
 
 
+_LAPS = 9.7  # no whole number, so that the laps of a round number of frames share no view
+
 _ROUTES = {
     "room": _Route("room", _around_room, 13),
+    "laps": _Route("room", lambda scene, s: _around_room(scene, _LAPS * s), 13),
     "orbit": _Route("objects", _around_object, 3),
     "corridor": _Route("corridor", _along_corridor, 8),
     "revisit": _Route("room", _back_in_room, 13, contrast=0.2, noise=0.01),
