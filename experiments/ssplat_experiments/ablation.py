@@ -272,8 +272,8 @@ def findings(rows: list[Row]) -> list[str]:
         for column in COLUMNS:
             differences = [row[f"full_minus_it_{column}_db"] for row in here if f"full_minus_it_{column}_db" in row]
             cells += [spread([row[f"{column}_psnr"] for row in here]), spread(differences) if differences else ""]
-        lpips = [row.get("literal_lpips") for row in here]
-        cells.append("" if None in lpips else f"{statistics.mean(lpips):.3f}")
+        lpips = [value for row in here if (value := row.get("literal_lpips")) is not None]
+        cells.append(f"{statistics.mean(lpips):.3f}" if lpips else "")
         cells.append(str(round(statistics.mean(row["gaussians"] for row in here))))
         lines.append("| " + " | ".join(cells) + " |")
     return ["\n".join(lines)]

@@ -43,13 +43,8 @@ class Change:
 
 def no_change(gaussians: Gaussians) -> Change:
     """The change of `gaussians` that changes nothing."""
-    return Change(
-        means=jnp.zeros_like(gaussians.means),
-        quats=jnp.zeros_like(gaussians.quats),
-        log_scales=jnp.zeros_like(gaussians.scales),
-        logit_opacities=jnp.zeros_like(gaussians.opacities),
-        sh=jnp.zeros_like(gaussians.sh),
-    )
+    parts = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    return Change(*map(jnp.zeros_like, parts))
 
 
 def apply_change(start: Gaussians, change: Change, *, max_scale: float = math.inf) -> Gaussians:

@@ -83,10 +83,7 @@ def shards_of(voxels: Int[Array, "*s 4"], num_shards: int) -> Int[Array, "*s"]:
 
 
 def find_rows(
-    table: Int[Array, " slots"],
-    voxels: Int[Array, "capacity 4"],
-    wanted: Int[Array, "m 4"],
-    active: Bool[Array, " m"],
+    table: Int[Array, " slots"], voxels: Int[Array, "capacity 4"], wanted: Int[Array, "m 4"], active: Bool[Array, " m"]
 ) -> Int[Array, " m"]:
     """Rows of the voxels `wanted`; -1 for those that are not stored or not `active`.
 

@@ -24,7 +24,7 @@ from ssplat_jax.cache.changes import empty_changes
 from ssplat_jax.cache.hash_table import SLOTS_PER_ROW, build_table
 from ssplat_jax.cache.key_views import NUM_KEY_VIEWS, KeyViews, empty_key_views
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.core.errors import CacheError, InputError
+from ssplat_jax.core.errors import CacheError, InputError, refusal
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import pytree, replace
 
@@ -109,11 +109,7 @@ class VoxelCache:
         return self.voxels.shape[-2]
 
 
-# fmt: off
-PIVOT_FIELDS = (
-    "means", "feats", "seeds", "confidences", "rgbs", "quats", "footprints", "num_members", "last_chunks",
-)
-# fmt: on
+PIVOT_FIELDS = ("means", "feats", "seeds", "confidences", "rgbs", "quats", "footprints", "num_members", "last_chunks")
 """Fields of every `VoxelCache` with one entry per pivot, `[capacity, k, ...]`."""
 
 OPTIONAL_PIVOT_FIELDS = ("observations", "changes")
@@ -145,10 +141,9 @@ def require_single_cache(cache: VoxelCache, caller: str) -> None:
         InputError: `cache` holds several caches.
     """
     if shape := cache.num_voxels.shape:
-        raise InputError(
-            f"{caller}: wanted the cache of one stream on one device, got caches of shape {list(shape)}; take one at a"
-            f" time, jax.tree.map(lambda x: x[{', '.join('0' * len(shape))}], caches)."
-        )
+        wanted, got = "the cache of one stream on one device", f"caches of shape {list(shape)}"
+        fix = f"take one at a time, jax.tree.map(lambda x: x[{', '.join('0' * len(shape))}], caches)"
+        raise refusal(caller, wanted=wanted, got=got, fix=fix)
 
 
 def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
@@ -294,6 +289,5 @@ def _over_all(reduce: Callable[[jax.Array], jax.Array], counters: Int[Array, "*b
 def _require_values(caches: VoxelCache, caller: str) -> None:
     """Raises if `caches` are traced, in the name of `caller`, which reads values."""
     if isinstance(caches.num_voxels, Tracer):
-        raise InputError(
-            f"{caller}: wanted a cache outside jit, vmap and scan, got a traced one; call it before or after."
-        )
+        wanted, fix = "a cache outside jit, vmap and scan", "call it before or after"
+        raise refusal(caller, wanted=wanted, got="a traced one", fix=fix)

@@ -47,13 +47,7 @@ COMMANDS = {
 """All commands by name, in the order of `ssplat --help`."""
 
 
-SETTINGS_OF_OTHERS = (
-    "JAX_ENABLE_X64",
-    "JAX_NUMPY_",
-    "JAX_TRANSFER_GUARD",
-    "JAX_DEFAULT_MATMUL_PRECISION",
-    "JAX_DISABLE_JIT",
-)
+REMOVED = ("JAX_ENABLE_X64", "JAX_NUMPY_", "JAX_TRANSFER_GUARD", "JAX_DEFAULT_MATMUL_PRECISION", "JAX_DISABLE_JIT")
 """Prefixes of environment variables that `main` removes, so that commands compute in float32 as JAX does by default."""
 
 
@@ -64,10 +58,11 @@ WITHOUT_PROGRAMS = "--no-program-cache"  # option of every command; it comes bef
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command in `arguments` (default: those of the process) and exits with its code."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    for name in [name for name in os.environ if name.startswith(SETTINGS_OF_OTHERS)]:
+    for name in [name for name in os.environ if name.startswith(REMOVED)]:
         del os.environ[name]
-    if arguments == ["--version"]:
-        print(_version())
+    if arguments == ["--version"]:  # for reports of errors; answers without importing JAX
+        packages = ", ".join(f"{name} {metadata.version(name)}" for name in ("jax", "jaxlib", "flax"))
+        print(f"ssplat {__version__} ({packages}, Python {platform.python_version()}, {platform.platform()})")
         sys.exit(0)
     if WITHOUT_PROGRAMS in arguments:
         arguments = [word for word in arguments if word != WITHOUT_PROGRAMS]
@@ -96,12 +91,6 @@ def _parse(arguments: list[str]):
         args=arguments,
         config=config,
     )
-
-
-def _version() -> str:
-    """Versions of the package and of what it stands on, for reports of errors; answers without importing JAX."""
-    packages = ", ".join(f"{name} {metadata.version(name)}" for name in ("jax", "jaxlib", "flax"))
-    return f"ssplat {__version__} ({packages}, Python {platform.python_version()}, {platform.platform()})"
 
 
 def guarded(run: Callable[[], int]) -> int:

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import platformdirs
 
+from ssplat_jax.core import num_cores
+
 SWITCH = "SSPLAT_PROGRAM_CACHE"  # environment variable: `off`, or a folder in place of the user's cache folder
 EXECUTABLES = "SSPLAT_EXECUTABLES"  # `core.kept_programs.SWITCH`: folder of the executables. That module imports JAX.
 
@@ -69,11 +71,6 @@ def replace_damaged(folder: Path) -> None:
             file.unlink(missing_ok=True)
 
     warnings.showwarning = shown
-
-
-def num_cores() -> int:
-    """As `core.cpu_backend.num_cores`, which imports JAX: it would read its variables before they are set here."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _machine() -> str:

@@ -4,8 +4,8 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+from rich.table import Column, Table
 
 WAITING = "compiling"  # note of a bar whose first step is not done: compiling is most of it
 
@@ -28,13 +28,7 @@ class Reporter:
         if not (is_kept or self.console.is_terminal):  # rich leaves an empty line in a file
             yield lambda done, note="": None
             return
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
-        )
+        columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), "{task.fields[note]}"
         with Progress(*columns, console=self.console, transient=not is_kept) as bar:
             task = bar.add_task(name, total=None, note=waiting)
             yield lambda done, note="": bar.update(task, completed=done, total=total, note=note)
@@ -55,9 +49,7 @@ class Reporter:
 
     def table(self, title: str, header: tuple[str, ...], rows: list[tuple]) -> None:
         """Prints a table of right-aligned columns."""
-        table = Table(title=title)
-        for name in header:
-            table.add_column(name, justify="right")
+        table = Table(*(Column(name, justify="right") for name in header), title=title)
         for row in rows:
             table.add_row(*map(str, row))
         self.console.print(table)

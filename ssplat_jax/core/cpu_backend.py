@@ -1,4 +1,4 @@
-"""Code that exists only for XLA's CPU backend: cores and memory maps of the process, and forms of arithmetic.
+"""Code that exists only for XLA's CPU backend: memory maps of the process, and forms of arithmetic.
 
 Each form has its measurement and when it may go, with jax 0.10.1 on two CPU cores. Two more stand where they are used:
 the kernel gradient in `model/layers.py`, and sort keys packed into one integer (`rasterizer/binning.py`,
@@ -8,7 +8,6 @@ the kernel gradient in `model/layers.py`, and sort keys packed into one integer 
 import functools
 import gc
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -34,11 +33,6 @@ MAPS = Path("/proc/self/maps")  # file with a line for each memory map of the pr
 MOST_MAPS = 25_000
 """Memory maps above which programs are dropped. A compiled program takes some tens of them, a scene that is streamed,
 refined and scored thousands, and Linux ends a process that has 65,530 (`vm.max_map_count`)."""
-
-
-def num_cores() -> int:
-    """Cores that this process may use; all of the machine where the system does not say (macOS)."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def make_room(*forget: Callable[[], None]) -> None:

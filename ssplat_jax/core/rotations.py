@@ -47,15 +47,11 @@ def matrices_to_quats(matrices: Float[Array, "*s 3 3"]) -> Float[Array, "*s 4"]:
     a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     d, e, f = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
     # Row i is 4 q_i q. Squares are on the diagonal, and the row with the largest one is well conditioned.
-    rows = jnp.stack(
-        [
-            jnp.stack([1 + m00 + m11 + m22, a, b, c], axis=-1),
-            jnp.stack([a, 1 + m00 - m11 - m22, d, e], axis=-1),
-            jnp.stack([b, d, 1 - m00 + m11 - m22, f], axis=-1),
-            jnp.stack([c, e, f, 1 - m00 - m11 + m22], axis=-1),
-        ],
-        axis=-2,
-    )
+    w = jnp.stack([1 + m00 + m11 + m22, a, b, c], axis=-1)
+    x = jnp.stack([a, 1 + m00 - m11 - m22, d, e], axis=-1)
+    y = jnp.stack([b, d, 1 - m00 + m11 - m22, f], axis=-1)
+    z = jnp.stack([c, e, f, 1 - m00 - m11 + m22], axis=-1)
+    rows = jnp.stack([w, x, y, z], axis=-2)
     best = jnp.argmax(jnp.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
     quats = safe_normalize(jnp.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :])
     return jnp.where(quats[..., :1] < 0, -quats, quats)
@@ -65,15 +61,11 @@ def multiply_quats(a: Float[Array, "*s 4"], b: Float[Array, "*s 4"]) -> Float[Ar
     """Hamilton product: the rotation `b` followed by the rotation `a`."""
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
     bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
-    return jnp.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
+    w = aw * bw - ax * bx - ay * by - az * bz
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    return jnp.stack([w, x, y, z], axis=-1)
 
 
 _C1 = 0.4886025119029199

@@ -53,7 +53,7 @@ def summarize(
     centers = capture.camtoworlds[:, :3, 3]
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
     median_step = float(np.median(steps)) if steps.size else 0.0
-    K, first = capture.K(0), capture.frames[0]
+    focal, first = np.diag(capture.K(0))[:2], capture.frames[0]
     if wrong_poses is not None:  # depths that follow from wrong poses would only mislead
         warnings = [wrong_poses]
     else:
@@ -65,8 +65,8 @@ def summarize(
         "num_depth_maps": sum(map(capture.pixels.has_depth, range(len(capture)))),
         "size": [capture.width, capture.height],  # of delivered images
         "stored_size": [first.width, first.height],
-        "focal": [float(K[0, 0]), float(K[1, 1])],
-        "fov_degrees": [_field(capture.width, K[0, 0]), _field(capture.height, K[1, 1])],
+        "focal": focal.tolist(),
+        "fov_degrees": np.degrees(2 * np.arctan([capture.width, capture.height] / (2 * focal))).tolist(),
         "path_length": float(steps.sum()),
         "extent": float(np.linalg.norm(np.ptp(centers, axis=0))),  # diagonal of the camera centers' bounding box
         "median_step": median_step,  # in stream order
@@ -82,11 +82,6 @@ def summarize(
         "voxel_in_capture_units": config.memory.voxel_size / scale,
         "warnings": [*capture.notes, *warnings, *order_warnings(capture)],
     }
-
-
-def _field(extent: int, focal: float) -> float:
-    """Field of view in degrees of an image side of `extent` pixels."""
-    return float(np.degrees(2 * np.arctan(extent / (2 * focal))))
 
 
 def _depth_warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> list[str]:

@@ -231,13 +231,9 @@ class Lens:
             r2 = x * x + y * y
             radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
             radial = radial / (1 + r2 * (self.d1 + r2 * (self.d2 + r2 * self.d3)))
-            return np.stack(
-                [
-                    x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
-                    y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
-                ],
-                axis=-1,
-            )
+            across = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+            along = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+            return np.stack([across, along], axis=-1)
 
     def pixels(self, K: Float64[np.ndarray, "3 3"], points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
         """Maps pixels of the pinhole image to pixels of the distorted one; both have the intrinsics `K`."""

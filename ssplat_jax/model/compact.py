@@ -256,17 +256,6 @@ def read_shapes(params, feats: Float[Array, "m c"], config: StreamConfig) -> Tok
 
 
 # -- All stages -------------------------------------------------------------------------------------------------------
-def refine_depth(params, features, depth: AnchoredDepth, views, config: StreamConfig) -> AnchoredDepth:
-    """`depth` unchanged: the matching grid is the feature grid."""
-    del params, features, views, config
-    return depth
-
-
-def bound_history(feats: Float[Array, "v hf wf c"]) -> Float[Array, "v hf wf c"]:
-    """`feats` unchanged: `mix_tokens` ends in a norm."""
-    return feats
-
-
 def stages(config: StreamConfig) -> dict:
     """Linen module and example inputs of every stage."""
     v, side, c = 2, config.network.attention_window, config.network.token_width
@@ -292,8 +281,8 @@ class CompactNetwork:
     stages = staticmethod(stages)
     encode = staticmethod(encode)
     match = staticmethod(match)
-    refine_depth = staticmethod(refine_depth)
+    refine_depth = staticmethod(lambda params, features, depth, views, config: depth)  # both grids are the same
     regress_tokens = staticmethod(regress_tokens)
-    bound_history = staticmethod(bound_history)
+    bound_history = staticmethod(lambda feats: feats)  # `mix_tokens` ends in a norm
     mix_tokens = staticmethod(mix_tokens)
     read_shapes = staticmethod(read_shapes)

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.hash_table import voxel_sides
-from ssplat_jax.cache.state import NUM_OBSERVED
 from ssplat_jax.cache.votes import observation_features
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
@@ -163,6 +162,7 @@ def _halved(images: Float[Array, "m s s 3"]) -> Float[Array, "m r r 3"]:
 
 MAX_LOGIT_CHANGE = 4.0  # bound of what is added to an opacity's logit
 MAX_LOG_CONTRAST = 1.0  # bound of the log factor on the differences between the colors of a pivot's Gaussians
+NUM_FEATURES = 18  # inputs of the evidence head: 7, and 11 of `observation_features`
 WIDTH = 32  # channels of the hidden layers
 
 
@@ -190,13 +190,6 @@ class EvidenceHead(nn.Module):
         x = nn.gelu(nn.Dense(WIDTH, name="hidden1")(x))
         x = nn.gelu(nn.Dense(WIDTH, name="hidden2")(x))
         return nn.Dense(4, kernel_init=nn.initializers.zeros, name="out")(x)
-
-
-def num_features() -> int:
-    """Number of inputs of the evidence head."""
-    one = jnp.ones(1)
-    evidence = Evidence(jnp.zeros((1, NUM_OBSERVED)), one, one, one, one, one, jnp.zeros((1, 3)))
-    return evidence_features(evidence, StreamConfig()).shape[1]
 
 
 def evidence_features(evidence: Evidence, config: StreamConfig) -> Float[Array, "m f"]:

@@ -18,7 +18,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.cgfi import Aggregator
 from ssplat_jax.model.compact import CompactNetwork
-from ssplat_jax.model.decoder import EvidenceHead, num_features
+from ssplat_jax.model.decoder import NUM_FEATURES, EvidenceHead
 from ssplat_jax.model.hpda import AnchorMaps, AnchorStrength, num_inputs
 from ssplat_jax.model.resplat import ReSplatNetwork
 from ssplat_jax.model.views import GRID_STRIDE, AnchoredDepth, DepthDistribution, TokenShapes, Views
@@ -207,7 +207,7 @@ def _modules(config: StreamConfig, network: Network) -> dict:
         "cgfi": (Aggregator(config), (grid(c), grid(c + config.additions.residual_cgfi), jnp.ones(v, bool))),
     }
     if config.head.evidence:
-        shared["evidence"] = (EvidenceHead(), (jnp.zeros((1, num_features())),))
+        shared["evidence"] = (EvidenceHead(), (jnp.zeros((1, NUM_FEATURES)),))
     return network.stages(config) | shared
 
 

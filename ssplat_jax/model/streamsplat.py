@@ -278,11 +278,6 @@ def count_gaussians(cache: VoxelCache, config: StreamConfig) -> Int[Array, ""]:
     return jnp.sum(is_shown & divide_cells(rgbs, config).present, dtype=jnp.int32)
 
 
-def shown_rows(cache: VoxelCache, config: StreamConfig, num: int) -> Int[Array, " m"]:
-    """Numbers of the first `num` pivots that `decode` shows, for `decode_rows`; -1 after the last."""
-    return jnp.nonzero(shown_pivots(cache, config).reshape(-1), size=num, fill_value=-1)[0]
-
-
 def _flatten_tokens(positions, feats, confidences, footprints, exposures, views: Views, config: StreamConfig) -> Tokens:
     """Maps flattened to tokens in order of insertion: view-major, row-major. Colors are at the scene's exposure."""
     v, hf, wf, _ = positions.shape

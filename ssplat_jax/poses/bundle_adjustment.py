@@ -216,10 +216,7 @@ MIN_MATCHES = 10  # fewest matches of a pair; fewer are mostly false
 
 
 def find_tracks(
-    capture: PosedImages,
-    indices: Sequence[int],
-    depth: float,
-    advance: Callable[[int], None] = lambda done: None,
+    capture: PosedImages, indices: Sequence[int], depth: float, advance: Callable[[int], None] = lambda done: None
 ) -> Observations:
     """Tracks through the frames `indices`, whose positions in `indices` are the numbers of the views.
 

@@ -156,16 +156,11 @@ def scan_video(path: Path, advance: Advance) -> tuple[Float64[np.ndarray, " n"],
         motion.append(max(motion[-1] if motion else 0.0, at_key + shift / width))
         if key is None or shift >= KEY_SHIFT:
             key, at_key = gray, motion[-1]
-        sharpnesses.append(sharpness(gray))
+        sharpnesses.append(float(np.mean(np.square(laplace(gray)[1:-1, 1:-1]))))  # comparable where frames are alike
         advance(len(motion))
     if len(motion) < 2:
         raise refusal(str(path), wanted="a video of a moving camera", got=f"{len(motion)} frames", fix=FIX)
     return np.array(motion), np.array(sharpnesses)
-
-
-def sharpness(gray: Float32[np.ndarray, "h w"]) -> float:
-    """Mean squared Laplacian of an image; comparable between frames that show the same things."""
-    return float(np.mean(np.square(laplace(gray)[1:-1, 1:-1])))
 
 
 def displacement(before: Float32[np.ndarray, "h w"], after: Float32[np.ndarray, "h w"]) -> float:

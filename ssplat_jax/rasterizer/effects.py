@@ -90,11 +90,6 @@ class Effects:
         return self.replace(**flags)
 
     @property
-    def screen_filter(self) -> str:
-        """The filter, `mip` if none is chosen."""
-        return self.antialias or "mip"
-
-    @property
     def needs_alpha(self) -> bool:
         """True if alpha is composited: asked for, or needed by depth or background."""
         return bool({"alpha", "depth"} & set(self.outputs)) or self.background is not None

@@ -150,13 +150,13 @@ def _shape_grads(gaussians: Gaussians, splats: Splats, grads: Splats, roots, eff
     """
     p, q, r = columns(splats.conic_factors)
     by_p, by_q, by_r = columns(grads.conic_factors)
-    kernel = FILTER_VARIANCES[effects.screen_filter]
+    kernel = FILTER_VARIANCES[effects.antialias or "mip"]
     if kernel < constants.MIN_RELATIVE_VARIANCE * constants.MAX_SCREEN_SIGMA**2:  # large rows have a larger one
         largest = sum(jnp.abs(jax.lax.stop_gradient(root)) for part in roots for root in part)
         kernel = jnp.maximum(kernel, constants.MIN_RELATIVE_VARIANCE * largest * largest)
     along_p = by_p * p + by_q * q
     by_compensation = over_compensation = 0.0  # times the compensation, and divided by it
-    if effects.screen_filter == "mip":
+    if effects.antialias in (None, "mip"):
         compensation = jnp.where(splats.visible, _compensation(gaussians, splats), 1.0)
         by_compensation = grads.opacities * splats.opacities
         over_compensation = grads.opacities * gaussians.opacities / compensation

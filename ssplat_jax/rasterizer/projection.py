@@ -24,7 +24,7 @@ FILTER_VARIANCES = {
     "classic": constants.CLASSIC_VARIANCE,
     "none": constants.MIN_SCREEN_VARIANCE,
 }
-"""px^2 added to the screen covariance, by `Effects.screen_filter`."""
+"""px^2 added to the screen covariance, by `Effects.antialias`; the projections take None as `mip`."""
 
 
 @pytree
@@ -192,7 +192,7 @@ def tangent_bounds(camera: Camera, wider: Float[Array, "b 1"] | None = None) -> 
 
 def _filtered(root_u, root_v, effects: Effects):
     """Conic factors, variances and opacity compensation of the screen covariance, filtered as `effects` say."""
-    kernel = FILTER_VARIANCES[effects.screen_filter]
+    kernel = FILTER_VARIANCES[effects.antialias or "mip"]
     # In units of the largest entry nothing overflows at any scale; the unit is a constant to the gradient.
     largest = sum(jnp.abs(jax.lax.stop_gradient(m)) for m in (*root_u, *root_v))
     sized = largest <= constants.MAX_SCREEN_SIGMA
@@ -208,7 +208,7 @@ def _filtered(root_u, root_v, effects: Effects):
     p = jnp.sqrt(0.5 * (vv + kernel) / det_filtered)
     factors = jnp.stack([p, -p * uv / (vv + kernel), jnp.sqrt(0.5 / (vv + kernel)) / unit], axis=-1)
     variances = jnp.stack([uu + kernel, vv + kernel], axis=-1) * (unit * unit)[..., None]
-    if effects.screen_filter != "mip":
+    if effects.antialias in ("classic", "none"):
         return factors, variances, jnp.where(sized, 1.0, 0.0).astype(unit.dtype)
     ratio = det * unit * unit / det_filtered
     keep = sized & (ratio > constants.MIN_COMPENSATION)

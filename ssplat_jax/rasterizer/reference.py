@@ -52,13 +52,11 @@ def render_reference(
     captured: Camera | None = None,
     distortion: Float[Array, "*b 5"] | None = None,
     exposures: Float[Array, "*b 3 4"] | None = None,
-    rows_at_once: int = 16,
 ) -> RenderOutput:
     """The images that `render` must give, in the dtype of `gaussians`.
 
     Args:
         gaussians, camera, effects, features, captured, distortion, exposures: as in `render`.
-        rows_at_once: rows of pixels computed together, which bounds the memory.
 
     Returns:
         The output; its counts of pairs are 0.
@@ -80,7 +78,7 @@ def render_reference(
         channels = jnp.concatenate([channels, jnp.ones_like(channels[..., :1])], axis=-1)
     xs, ys = (jnp.arange(size, dtype=channels.dtype) + 0.5 for size in (camera.width, camera.height))
     pixels = jnp.stack(jnp.broadcast_arrays(xs[None, :], ys[:, None]), axis=-1)
-    bands = [pixels[i : i + rows_at_once].reshape(-1, 2) for i in range(0, camera.height, rows_at_once)]
+    bands = [pixels[i : i + 16].reshape(-1, 2) for i in range(0, camera.height, 16)]  # of 16 rows: bounds the memory
     images, medians = [], []
     for i in range(flat.viewmats.shape[0]):
         one = jax.tree.map(lambda x, i=i: x[i : i + 1], splats)

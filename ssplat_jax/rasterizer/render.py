@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Num
 
 from ssplat_jax.core.cameras import Camera, check_camera, is_whole, relative_to
-from ssplat_jax.core.errors import InputError, echo
+from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.core.gaussians import Gaussians, check_gaussians
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.numerics import power_of_two, with_rank_promotion
@@ -129,7 +129,7 @@ def render(
         # Under `jax.grad` alone the primal values are concrete: without tangents, the pairs can be counted.
         counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
         is_guessed = isinstance(counted, Tracer)
-        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_guessed else capacity_for(int(counted), num_rows)
+        max_pairs = min(round_up(4 * num_rows), MAX_CAPACITY) if is_guessed else capacity_for(int(counted), num_rows)
     out = _render_jit(inputs, effects, max_pairs, tile)
     if not isinstance(out.num_overflow, Tracer) and int(out.num_overflow):
         out = _render_jit(inputs, effects, capacity_for(int(out.num_pairs), num_rows), tile)
@@ -180,10 +180,8 @@ def capacity_for(num_pairs: int, num_rows: int) -> int:
         InputError: an index would not reach the last pair.
     """
     if num_pairs > MAX_CAPACITY:
-        raise InputError(
-            f"render: wanted at most {MAX_CAPACITY} (tile, Gaussian) pairs, got more; render fewer cameras at once or"
-            " pass tile=16."
-        )
+        wanted = f"at most {MAX_CAPACITY} (tile, Gaussian) pairs"
+        raise refusal("render", wanted=wanted, got="more", fix="render fewer cameras at once or pass tile=16")
     return max(round_up(num_pairs), min(power_of_two(num_rows), SMALL_CAPACITY))
 
 
@@ -201,12 +199,6 @@ def _at_least_one_row(inputs: RenderInputs) -> RenderInputs:
         return inputs
     one = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), (inputs.gaussians, inputs.features))
     return replace(inputs, gaussians=one[0], features=one[1])
-
-
-def default_max_pairs(gaussians: Gaussians, camera: Camera) -> int:
-    """Default capacity inside jit: four pairs for each Gaussian and camera, as a power of two."""
-    cameras = camera.viewmats.size // 16
-    return min(round_up(4 * cameras * gaussians.num_gaussians), MAX_CAPACITY)
 
 
 def round_up(num_pairs: int) -> int:

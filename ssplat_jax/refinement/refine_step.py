@@ -138,13 +138,7 @@ def refine_step(
         zeros = jax.tree.map(jnp.zeros_like, current)
         total = jax.tree.map(lambda zero, x: zero.at[rows].set(x, mode="drop"), zeros, total)
     (gradient,) = pull_back(total)
-    report = StepReport(
-        loss=jnp.mean(losses),
-        held_back=jnp.mean(held_back),
-        views=views,
-        num_missing_rows=num_missing,
-        num_overflow=jnp.max(overflows),
-    )
+    report = StepReport(jnp.mean(losses), jnp.mean(held_back), views, num_missing, jnp.max(overflows))
     return _moved(state, gradient, report.loss, rate), report
 
 
@@ -167,13 +161,8 @@ def _moved(state: RefineState, gradient: Change, loss: Float[Array, ""], rate: F
     change = bounded(Change(**moved), state.start)
     keep = lambda new, old: jnp.where(is_finite, new, old)  # noqa: E731
     change, adam = jax.tree.map(keep, (change, adam), (state.change, state.adam))
-    return replace(
-        state,
-        change=change,
-        adam=adam,
-        num_steps=state.num_steps + 1,
-        num_skipped=state.num_skipped + (~is_finite).astype(jnp.int32),
-    )
+    num_steps, num_skipped = state.num_steps + 1, state.num_skipped + (~is_finite).astype(jnp.int32)
+    return replace(state, change=change, adam=adam, num_steps=num_steps, num_skipped=num_skipped)
 
 
 def units(gaussians: Gaussians) -> dict[str, Array | float]:

@@ -12,7 +12,7 @@ import numpy as np
 from ssplat_jax.core.console import WAITING, Reporter
 from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.open_capture import is_done, open_capture, open_growing, without_tilde
+from ssplat_jax.data.open_capture import DONE, open_capture, open_growing, without_tilde
 from ssplat_jax.data.readers.transforms_json import num_listed
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import check_look_ahead
@@ -193,7 +193,8 @@ class GrowingCapture:
 
     def look(self) -> None:
         """Looks at the folder, and takes the frames that have become complete."""
-        said_so = is_done(self._path)  # before the look: what was written before the file counts
+        # Before the look: what was written before the file counts.
+        said_so = ((self._path.parent if self._path.is_file() else self._path) / DONE).exists()
         if (listed := num_listed(self._path)) > self._most_listed:
             self._most_listed, self._last_change = listed, time.monotonic()
         capture, self._problem = open_growing(self._path, size=self._options.image_size)

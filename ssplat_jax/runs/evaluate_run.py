@@ -25,7 +25,7 @@ from ssplat_jax.data.split import (
     split_of_scene,
 )
 from ssplat_jax.evaluation.metrics import installed_lpips
-from ssplat_jax.evaluation.pictures import save_comparison, save_image
+from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.evaluation.scoring import ScoredView, evaluate, mean_scores, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
@@ -239,7 +239,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
         rows.append(row | {"coverage": coverage, "num_gaussians": num_gaussians})
     strip = [views[len(views) // 2].color for views in scored]
     for view in scored[-1]:
-        save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, stream_frame.depth_range)
+        view.save(folder.target(view.score.frame), stream_frame.depth_range)
     strip.append(scored[-1][len(split.targets) // 2].target)
     save_image(out / "views_4_8_16_32_64_target.png", np.concatenate(strip, axis=1))
     metrics = {

@@ -17,7 +17,7 @@ from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import peak_memory
-from ssplat_jax.evaluation.pictures import report_page, save_comparison
+from ssplat_jax.evaluation.pictures import report_page
 from ssplat_jax.evaluation.scoring import ViewScore, exposures_to_json, score_view
 from ssplat_jax.runs.open_run import OpenRun
 from ssplat_jax.scene_files.formats import ExportReport, save_gaussians
@@ -135,7 +135,7 @@ def picture_views(
     scores = []
     for i in shown_frames(indices):
         view = score_view(gaussians, capture, i, stream_frame, exposures)
-        save_comparison(folder.view(i), view.target, view.color, view.depth, stream_frame.depth_range)
+        view.save(folder.view(i), stream_frame.depth_range)
         scores.append(view.score)
     return scores
 

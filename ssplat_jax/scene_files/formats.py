@@ -19,8 +19,6 @@ from ssplat_jax.scene_files.splat_rows import RENDER_MODES, SplatRows, encode_sp
 from ssplat_jax.scene_files.spz import RUB, decode_spz, encode_spz
 
 FilePath = str | os.PathLike
-Offset = tuple[float, float, float]
-ORIGIN: Offset = (0.0, 0.0, 0.0)
 RETRY = "check the path, or write the file again"
 # By the end of the file's name. A .ply may be a compressed one, whatever its name.
 WRITERS: dict[str, Callable[..., bytes]] = {".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog}
@@ -35,8 +33,8 @@ class ExportReport:
 
     num_written: int
     num_dropped: int  # with non-finite entries, a negative scale, or an opacity below 1/255 (absent rows included)
-    offset: Offset = ORIGIN  # to add to the positions in the file
-    num_cut: int = 0  # left out because there were more than wanted
+    offset: tuple[float, float, float]  # to add to the positions in the file
+    num_cut: int  # left out because there were more than wanted
 
     @property
     def warning(self) -> str | None:
@@ -51,9 +49,8 @@ def check_format(path: FilePath, option: str = "--to", formats: Collection[str] 
     # Nothing writes a .compressed.ply, though its name ends with .ply.
     suffix = next((suffix for suffix in (".compressed.ply", *SCENE_READERS, *WRITERS) if name.endswith(suffix)), "")
     if suffix not in formats:
-        raise refusal(
-            option, wanted=f"a file named *{', *'.join(formats)}", got=repr(Path(path).name), fix="choose one of these"
-        )
+        wanted = f"a file named *{', *'.join(formats)}"
+        raise refusal(option, wanted=wanted, got=repr(Path(path).name), fix="choose one of these")
     return suffix
 
 
@@ -62,8 +59,6 @@ def save_gaussians(
     gaussians: Gaussians,
     *,
     suffix: str | None = None,
-    render_mode: str | None = None,
-    offset: Offset | None = None,
     max_splats: int | None = None,
     spz_version: int = 4,
     start_camera: dict[str, Any] | None = None,
@@ -72,12 +67,9 @@ def save_gaussians(
 
     Args:
         path: the file to write. Missing folders are created.
-        gaussians: the scene, in the frame of the file.
+        gaussians: the scene, in the frame of the file. A .spz and a .sog store of its render mode only whether it is
+            "mip", a .splat nothing; none of the three stores its offset.
         suffix: the format, one of `WRITERS`; by default the one that the file's name ends with.
-        render_mode: the renderer that the scene is made for, one of `RENDER_MODES`, by default what `gaussians` say; a
-            .spz and a .sog store only whether it is "mip", a .splat nothing.
-        offset: origin of `gaussians` in the frame of the capture, by default theirs; a .spz, .sog or .splat does not
-            store it.
         max_splats: most Gaussians to write; opaque ones are kept first, everywhere alike.
         spz_version: version of a .spz, 4 or 3.
         start_camera: position, target and vertical angle of view (degrees) of the camera with which viewers may start;
@@ -89,22 +81,19 @@ def save_gaussians(
     """
     encode = WRITERS[suffix or check_format(path)]
     options = {encode_spz: {"version": spz_version}, encode_sog: {"start_camera": start_camera}}.get(encode, {})
-    render_mode = gaussians.render_mode if render_mode is None else render_mode
-    offset = gaussians.offset if offset is None else offset
-    if render_mode not in RENDER_MODES:
-        raise refusal("render_mode", wanted=f"one of {', '.join(RENDER_MODES)}", got=repr(render_mode), fix="use one")
+    mode, offset = gaussians.render_mode, gaussians.offset
+    if mode not in RENDER_MODES:
+        raise refusal("render_mode", wanted=f"one of {', '.join(RENDER_MODES)}", got=repr(mode), fix="use one")
     if max_splats is not None and max_splats < 1:
         raise refusal("--max-splats", wanted="at least 1", got=max_splats, fix="leave it out to write all")
     rows, num_cut = rows_to_write(gaussians, max_splats)
-    write_atomic(path, encode(dataclasses.replace(rows, render_mode=render_mode, offset=offset), **options))
+    write_atomic(path, encode(dataclasses.replace(rows, render_mode=mode, offset=offset), **options))
     return ExportReport(len(rows), gaussians.num_gaussians - len(rows) - num_cut, offset, num_cut)
 
 
-def save_ply(
-    path: FilePath, gaussians: Gaussians, *, render_mode: str | None = None, offset: Offset | None = None
-) -> ExportReport:
+def save_ply(path: FilePath, gaussians: Gaussians) -> ExportReport:
     """Writes a 3DGS .ply, whatever the file's name; see `save_gaussians`."""
-    return save_gaussians(path, gaussians, suffix=".ply", render_mode=render_mode, offset=offset)
+    return save_gaussians(path, gaussians, suffix=".ply")
 
 
 def save_spz(path: FilePath, gaussians: Gaussians, *, version: int = 4) -> ExportReport:

@@ -90,8 +90,11 @@ def load_params(name: str = "tiny") -> dict:
     path = _path_of(name)
     arrays, facts = _read(path)
     config = preset(name) if name in PRESETS else facts.config
-    is_known = path.parent == SHIPPED and config == facts.config  # a test compares the shapes
-    return _restore(path, arrays, config, _tree(arrays, config) if is_known else None)
+    shapes = None
+    if path.parent == SHIPPED and config == facts.config:  # a test compares the shapes
+        empty = {name: {} for name in stages_of(config)}  # some stages need no parameters
+        shapes = empty | traverse_util.unflatten_dict(arrays, sep="/")
+    return _restore(path, arrays, config, shapes)
 
 
 def _path_of(name: str) -> Path:
@@ -184,11 +187,6 @@ def _restore(path: Path | str, arrays: Mapping[str, Any], config: StreamConfig, 
         return jax.device_put(np.asarray(arrays[name], np.float32))  # jnp.asarray compiles a program for each shape
 
     return jax.tree_util.tree_map_with_path(leaf, _shapes(config) if shapes is None else shapes)
-
-
-def _tree(arrays: Mapping[str, Any], config: StreamConfig) -> dict:
-    """The tree of arrays by path; stages that need no parameters have an empty one."""
-    return {name: {} for name in stages_of(config)} | traverse_util.unflatten_dict(arrays, sep="/")
 
 
 @functools.lru_cache(maxsize=8)  # tracing a network takes a second

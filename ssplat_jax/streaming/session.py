@@ -24,7 +24,7 @@ from ssplat_jax.core.numerics import power_of_two
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, count_gaussians, shown_pivots, shown_rows
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, count_gaussians, shown_pivots
 from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.streaming.live_views import LiveViews, widen_range
 
@@ -289,7 +289,8 @@ def _decode_shown(
     model: StreamSplat, num_pivots: int, num_gaussians: int | None, params: dict, cache: VoxelCache
 ) -> Gaussians:
     """The Gaussians of the pivots that are shown, of which there are at most `num_pivots`."""
-    return model.decode_rows(params, cache, shown_rows(cache, model.config, num_pivots), num_gaussians)
+    pivots = jnp.nonzero(shown_pivots(cache, model.config).reshape(-1), size=num_pivots, fill_value=-1)[0]
+    return model.decode_rows(params, cache, pivots, num_gaussians)
 
 
 @functools.partial(Kept, static_argnums=(1,))

@@ -23,7 +23,7 @@ from jaxtyping import PyTree
 
 from ssplat_jax.cache.state import VoxelCache, grow, required_capacity
 from ssplat_jax.core.chunk import Chunk
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
@@ -68,11 +68,10 @@ class ShardedStream:
     mesh: Mesh
 
     def __post_init__(self) -> None:
-        if self.model.config.stream.steps_per_chunk:
-            raise InputError(
-                "sharded stream: wanted stream.steps_per_chunk=0, which only a Session carries out, got "
-                f"{self.model.config.stream.steps_per_chunk}; set it to 0 and refine the finished scene with ss.refine."
-            )
+        if steps := self.model.config.stream.steps_per_chunk:
+            wanted = "stream.steps_per_chunk=0, which only a Session carries out"
+            fix = "set it to 0 and refine the finished scene with ss.refine"
+            raise refusal("sharded stream", wanted=wanted, got=steps, fix=fix)
         if not set(AXES) <= set(self.mesh.axis_names):
             raise InputError(
                 f"sharded stream: the mesh needs the axes {STREAMS} and {VOXELS}, got {self.mesh.axis_names}; give an"

@@ -17,8 +17,8 @@ import numpy as np
 import optax
 
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core import num_cores
 from ssplat_jax.core.atomic import write_atomic
-from ssplat_jax.core.cpu_backend import num_cores
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import pytree
 from ssplat_jax.evaluation.metrics import LpipsWeights

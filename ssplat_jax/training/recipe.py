@@ -156,36 +156,22 @@ STREAM_RECIPE = Recipe(
 """Trains the stages behind a trained matcher. The shipped weights do not include it, because it lowered the scores
 of captures (docs/model_card.md)."""
 
+_EVIDENCE = Phase("evidence", 480, Crops(), CropLoss(), ("evidence",), 5e-3, final_share=0.0, warmup_steps=20)
 EVIDENCE_RECIPE = Recipe(
-    phases=(Phase("evidence", 480, Crops(), CropLoss(), ("evidence",), 5e-3, final_share=0.0, warmup_steps=20),),
-    adam_b2=0.999,
-    weight_decay=1e-3,
-    clip_norm=3.0,
-    ema_decay=0.98,
-    untrained=("evidence",),
+    (_EVIDENCE,), adam_b2=0.999, weight_decay=1e-3, clip_norm=3.0, ema_decay=0.98, untrained=("evidence",)
 )
 """Trains the evidence head of weights whose other stages stay as they are."""
 
+_PAPER_DEPTH = DepthLoss(capacity=1 << 16, recompute=True)
 # The paper renders all tokens over black alone, at one exposure, and adds up the losses of the target views.
 _PAPER_LOSS = RenderingLoss(
-    depth=DepthLoss(capacity=1 << 16, recompute=True),
-    depth_weight=0.0,
-    weight=4.0,
-    tokens="all",
-    black_weight=1.0,
-    fit_gains=False,
-    max_pairs=1 << 22,
+    depth=_PAPER_DEPTH, depth_weight=0.0, weight=4.0, tokens="all", black_weight=1.0, fit_gains=False, max_pairs=1 << 22
 )
 # Its voxels and its anchor have lengths in the units of the poses: scale, near and far are those of the capture.
 _PAPER_VIEWS = ViewSamples(4, ((256, 256),), num_targets=4, range_jitter=0.0)
 _PAPER_STAGES = (*MATCHER, *AFTER_MATCHER)
-PAPER_RECIPE = Recipe(
-    (Phase("paper", 100_000, _PAPER_VIEWS, _PAPER_LOSS, _PAPER_STAGES, 1e-4, final_share=1.0, warmup_steps=1),),
-    adam_b2=0.999,
-    clip_norm=None,
-    ema_decay=0.0,
-    captures_alone=True,
-)
+_PAPER = Phase("paper", 100_000, _PAPER_VIEWS, _PAPER_LOSS, _PAPER_STAGES, 1e-4, final_share=1.0, warmup_steps=1)
+PAPER_RECIPE = Recipe((_PAPER,), adam_b2=0.999, clip_norm=None, ema_decay=0.0, captures_alone=True)
 """The paper's training to the letter: 100,000 steps of AdamW at a constant 1e-4 with one sample of a capture each,
 through all stages. It needs LPIPS weights for the second term and a GPU, and starts from imported weights. Where the
 paper is silent, AdamW has PyTorch's defaults, and a sample four chunks and four targets of 256 x 256."""

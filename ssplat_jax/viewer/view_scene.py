@@ -130,6 +130,7 @@ class Browser:
 
     def _add_frustum(self, view: RecordedView) -> Any:
         (width, height), pose = self._stage.run.records[0].size, self._stage.to_browser(view.camtoworld)
+        wxyz, position = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True), pose[:3, 3]
         node = self._client.scene.add_camera_frustum(
             f"/cameras/{view.frame}",
             fov=float(2 * np.arctan(height / 2 / view.K[1, 1])),
@@ -139,10 +140,10 @@ class Browser:
             thickness=1.5,
             thickness_units="screen",
             image=open_thumbnail(view.thumbnail),
-            wxyz=_wxyz(pose),
-            position=pose[:3, 3],
+            wxyz=wxyz,
+            position=position,
         )
-        node.on_click(lambda _: self._go_to(pose))
+        node.on_click(lambda _: self._go_to(position, wxyz))
         return node
 
     # -- pictures by our rasterizer -----------------------------------------------------------------------------------
@@ -185,14 +186,9 @@ class Browser:
             camera.up_direction, camera.position = -pose[:3, 1], pose[:3, 3]
             camera.look_at = pose[:3, 3] + pose[:3, 2]
 
-    def _go_to(self, pose: Float64[np.ndarray, "4 4"]) -> None:
+    def _go_to(self, position: Float64[np.ndarray, "3"], wxyz: Float64[np.ndarray, "4"]) -> None:
         with self._client.atomic():
-            self._client.camera.position, self._client.camera.wxyz = pose[:3, 3], _wxyz(pose)
-
-
-def _wxyz(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4"]:
-    """The quaternion of a pose."""
-    return Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+            self._client.camera.position, self._client.camera.wxyz = position, wxyz
 
 
 class Viewer:

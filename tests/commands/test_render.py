@@ -7,6 +7,7 @@ from PIL import Image
 
 import ssplat_jax as ss
 from ssplat_jax.core.gaussians import mean_color
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.evaluation import scoring
 from ssplat_jax.rasterizer import Effects, fill_holes
@@ -82,7 +83,7 @@ def test_a_run_is_drawn_from_its_adjusted_poses(tmp_path, capture):
 def test_a_scene_of_any_format_is_drawn_with_the_filter_that_it_names(tmp_path, capture, name, antialias):
     file = tmp_path / name
     if name == "scene.ply":
-        ss.save_ply(file, scene(), render_mode="default")
+        ss.save_ply(file, replace(scene(), render_mode="default"))
         file.write_bytes(file.read_bytes().replace(b"comment SplatRenderMode: default\n", b""))
     else:
         save_gaussians(file, scene())

@@ -18,7 +18,7 @@ from ssplat_jax.rasterizer import Effects, binning, compositing, constants, effe
 from ssplat_jax.rasterizer.binning import Grid, TileIntersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.projection import Splats, project
 from ssplat_jax.rasterizer.reference import render_reference
-from ssplat_jax.rasterizer.render import TILES, default_max_pairs
+from ssplat_jax.rasterizer.render import TILES, round_up
 from ssplat_jax.scene_files.formats import save_ply
 from tests.rasterizer import oracle
 from tests.rasterizer.scenes import cameras, cloud
@@ -164,7 +164,7 @@ def test_a_transform_that_hides_the_number_of_pairs_says_if_its_guess_was_too_lo
     """Large Gaussians, of more than four tiles each; 4,096 pairs are the least that is guessed."""
     gaussians, camera = cloud(600, size=0.2), cameras(80, 96)
     counted = int(render(gaussians, camera).num_pairs)
-    assert counted > default_max_pairs(gaussians, camera)
+    assert counted > round_up(4 * gaussians.num_gaussians)
     batch = jax.tree.map(lambda x: x[None], gaussians) if transform is jax.vmap else gaussians
     warnings.simplefilter("always")
     jax.block_until_ready(transform(lambda g: render(g, camera).color)(batch))
@@ -179,7 +179,7 @@ def test_gradients_outside_jit_include_every_pair():
     # Larger Gaussians than the default capacity inside jit is made for: more than four tiles each.
     gaussians, camera = cloud(600, size=0.2), cameras(80, 96)
     counted = int(render(gaussians, camera).num_pairs)
-    assert counted > default_max_pairs(gaussians, camera)
+    assert counted > round_up(4 * gaussians.num_gaussians)
     loss = lambda g, **options: jnp.sum(render(g, camera, **options).color ** 2)  # noqa: E731
     value, gradient = jax.value_and_grad(loss)(gaussians)
     wanted_value, wanted = jax.jit(jax.value_and_grad(functools.partial(loss, max_pairs=counted)))(gaussians)

@@ -118,7 +118,7 @@ def test_values_at_the_ends_of_their_range_are_clipped(tmp_path, suffix):
 def test_a_scene_carries_its_renderer_and_its_offset_where_the_format_can(tmp_path, suffix):
     offset = tuple(np.array([4.5e6, -0.1, 3.0]))  # numbers of NumPy, as a pose gives them
     for mode in ("mip", "default"):
-        report = save_gaussians(tmp_path / f"a{suffix}", scene_for(), render_mode=mode, offset=offset)
+        report = save_gaussians(tmp_path / f"a{suffix}", replace(scene_for(), render_mode=mode, offset=offset))
         found = ss.load_scene(tmp_path / f"a{suffix}")
         assert found.render_mode == mode
         assert found.offset == (offset if suffix in (".ply", ".glb") else (0.0, 0.0, 0.0))
@@ -139,9 +139,9 @@ def test_a_loaded_scene_is_drawn_as_it_is_meant(tmp_path):
     assert np.abs(classic - mip).max() > 0.05
     for mode, wanted in (("default", classic), ("mip", mip)):
         for where, at in ((view, (0.0, 0.0, 0.0)), (far, offset)):
-            ss.save_ply(tmp_path / "a.ply", plain, render_mode=mode, offset=at)
+            ss.save_ply(tmp_path / "a.ply", replace(plain, render_mode=mode, offset=at))
             np.testing.assert_allclose(draw(ss.load_scene(tmp_path / "a.ply"), where).color, wanted, atol=2e-4)
-    ss.save_ply(tmp_path / "a.ply", plain, render_mode="2dgs")
+    ss.save_ply(tmp_path / "a.ply", replace(plain, render_mode="2dgs"))
     discs = ss.load_scene(tmp_path / "a.ply")
     with pytest.raises(InputError, match="made for 2dgs"):
         ss.render(discs, view)
@@ -178,7 +178,7 @@ def test_sh_of_no_degree_that_files_hold_is_refused(tmp_path, terms):
         with pytest.raises(InputError, match=f"1, 4, 9 or 16 terms for each Gaussian, got {terms}"):
             save_gaussians(tmp_path / f"a{suffix}", spoiled)
     with pytest.raises(InputError, match="render_mode"):
-        ss.save_ply(tmp_path / "b.ply", scene(0), render_mode="antialiased")
+        ss.save_ply(tmp_path / "b.ply", replace(scene(0), render_mode="antialiased"))
     assert not any(tmp_path.iterdir())
 
 

@@ -214,8 +214,8 @@ def test_what_cannot_be_told_apart_is_not_kept(store):
 
 def test_an_embedded_scene_is_made_once_and_again_where_its_entry_is_damaged(store, monkeypatch):
     made, wanted = [], ("room", 2, 16, 24, 0)
-    cast = procedural_views._cast
-    monkeypatch.setattr(procedural_views, "_cast", lambda *given: made.append(0) or cast(*given))
+    cast = procedural_views.raycast
+    monkeypatch.setattr(procedural_views, "raycast", lambda *given: made.append(0) or cast(*given))
 
     def views(*wanted):
         return kept_result(lambda: procedural_views.procedural_capture_arrays(*wanted), "views", *wanted)

@@ -69,7 +69,8 @@ def training_sample(
         sky = SKY_DISTANCE if kind == "yard" else np.inf
         found = _scaled_path(rng, scene, _PATHS[kind], num_views, height, width, steps, sky)
     scene, poses, Ks, factor = found
-    images, depths = _cast(scene, poses, Ks, height, width, 1)  # a third of the cost of two rays
+    # One ray a pixel costs a third of two.
+    images, depths = map(np.asarray, raycast(scene, _inverted(poses), Ks, height, width, 1))
     depths = np.where(depths < factor * sky, depths, np.inf).astype(np.float32)
     return _through_sensor(rng, scene, images), depths, poses, Ks
 
@@ -109,12 +110,6 @@ def _probe(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: 
     depths = np.asarray(raycast(scene, _inverted(poses), coarse, rows, cols, 0)[1])
     nearer = depths[depths < sky]
     return nearer if 2 * len(nearer) > depths.size else nearer[:0]
-
-
-def _cast(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int, supersample: int = 2):
-    """Images and depths of all views, as NumPy arrays."""
-    images, depths = raycast(scene, _inverted(poses), Ks, height, width, supersample)
-    return np.asarray(images), np.asarray(depths)
 
 
 def _inverted(poses: np.ndarray) -> np.ndarray:
@@ -157,7 +152,7 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
     focal = 0.8 * max(height, width)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
     Ks = np.tile(K, (num_frames, 1, 1))
-    images, depths = _cast(scene, poses, Ks, height, width)
+    images, depths = map(np.asarray, raycast(scene, _inverted(poses), Ks, height, width, 2))
     images = images * np.float32(np.clip(images.mean(), 0.38, 0.55) / images.mean())
     if route.noise:
         images = images + np.float32(route.noise) * rng.standard_normal(images.shape, np.float32)

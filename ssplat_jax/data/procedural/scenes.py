@@ -106,13 +106,8 @@ def _trinket(b: SceneBuilder, x: float, y: float, z: float, size: float) -> None
     if shape == "ball":
         half[:] = half[1]
     half[2] = half[0] if shape == "cylinder" else half[2]
-    b.add(
-        str(shape),
-        [x, y - half[1], z],
-        half,
-        finish,
-        None if shape == "ball" else yaw_rotation(b.rng.uniform(0, 2 * np.pi)),
-    )
+    rotation = None if shape == "ball" else yaw_rotation(b.rng.uniform(0, 2 * np.pi))
+    b.add(str(shape), [x, y - half[1], z], half, finish, rotation)
 
 
 _FURNITURE: tuple[Callable[[SceneBuilder, float, float, float, float], None], ...] = (

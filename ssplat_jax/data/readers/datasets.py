@@ -232,16 +232,12 @@ KITTI = Reader("KITTI", _is_kitti, _read_kitti)
 # beside the text file. Lines without an image are skipped, since videos disappear.
 
 NUM_COLUMNS = 19  # per line
-
-
-def _camera_files(path: Path) -> list[Path]:
-    """The file of cameras at `path`, or those in the folder `path`; other text files may lie beside them."""
-    return files_with(path, ".txt", rb"\Ahttp")
+TEXT = (".txt", rb"\Ahttp")  # suffix and start of a file of cameras; other text files may lie beside it
 
 
 def _read_realestate10k(path: Path, convention: Convention) -> Listing:
     """The frames whose images exist."""
-    (file,) = _camera_files(path)
+    (file,) = files_with(path, *TEXT)
     frames, lines = FrameList(file.parent, convention), [(w, line) for w, line in load_lines(file)[1:] if line]
     rows = load_rows(file, NUM_COLUMNS, lines)
     for (where, _), row in zip(lines, rows, strict=True):
@@ -258,7 +254,7 @@ def _read_realestate10k(path: Path, convention: Convention) -> Listing:
 
 
 TO_CAMERA = Convention(poses="world-to-camera")
-REALESTATE10K = Reader("RealEstate10K", lambda path: len(_camera_files(path)) == 1, _read_realestate10k, TO_CAMERA)
+REALESTATE10K = Reader("RealEstate10K", lambda path: len(files_with(path, *TEXT)) == 1, _read_realestate10k, TO_CAMERA)
 
 # -- LLFF -------------------------------------------------------------------------------------------------------------
 # `poses_bounds.npy` and the images, in the order of their names. A row holds a 3x5 matrix row by row and two depths,

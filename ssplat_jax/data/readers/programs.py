@@ -140,15 +140,11 @@ RECORD3D = Reader("Record3D", _is_record3d, _read_record3d, OPENGL)
 CSV_POSE = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 CSV_LENS = {"px": "px", "py": "py", "k1": "k1", "k2": "k2", "k3": "k3", "k4": "k4", "p1": "t1", "p2": "t2"}
 SENSOR = 36.0  # millimeters of the longer side
-
-
-def _tables(path: Path) -> list[Path]:
-    """The file at `path`, or those in the folder `path`, that begin with the names of a camera's columns."""
-    return files_with(path, ".csv", b"name", b"heading", b"pitch", b"roll")
+CSV = (".csv", b"name", b"heading", b"pitch", b"roll")  # suffix, and names of columns with which a file begins
 
 
 def _read_reality_capture(path: Path, convention: Convention) -> Listing:
-    (file,) = _tables(path)
+    (file,) = files_with(path, *CSV)
     text = load_text(file)
     with reading(file):
         rows = list(csv.DictReader(text.lstrip("#").splitlines(), skipinitialspace=True))
@@ -173,7 +169,7 @@ def _read_reality_capture(path: Path, convention: Convention) -> Listing:
     return frames.listing(len(rows), "image")
 
 
-REALITY_CAPTURE = Reader("RealityCapture", lambda path: len(_tables(path)) == 1, _read_reality_capture, OPENGL)
+REALITY_CAPTURE = Reader("RealityCapture", lambda path: len(files_with(path, *CSV)) == 1, _read_reality_capture, OPENGL)
 
 # -- Metashape --------------------------------------------------------------------------------------------------------
 # XML of cameras (File, Export, Export Cameras, Agisoft XML). A camera's `transform` is its 4x4 camera-to-chunk matrix
@@ -184,16 +180,12 @@ REALITY_CAPTURE = Reader("RealityCapture", lambda path: len(_tables(path)) == 1,
 
 OFF = ("", "0", "false", "disabled")  # values of a switch
 XML_LENS = {"k1": "k1", "k2": "k2", "k3": "k3", "k4": "k4", "p1": "p2", "p2": "p1"}
-
-
-def _documents(path: Path) -> list[Path]:
-    """The file at `path`, or those in the folder `path`, that begin as Metashape's do."""
-    return files_with(path, ".xml", b"<document", b"<chunk")
+DOCUMENT = (".xml", b"<document", b"<chunk")  # suffix, and what a file of Metashape begins with
 
 
 def _read_metashape(path: Path, convention: Convention) -> Listing:
     """The aligned cameras whose images exist."""
-    (file,) = _documents(path)
+    (file,) = files_with(path, *DOCUMENT)
     text = load_text(file)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities could grow without bound
         raise refusal(str(file), wanted="XML without definitions", got="a document type", fix=AGAIN)
@@ -249,4 +241,4 @@ def _calibration(sensor: ElementTree.Element | None, where: str) -> tuple[Intrin
     return Intrinsics(f + values.number("b1", 0.0), f, cx, cy, model(**lens)), where, (width, height)
 
 
-METASHAPE = Reader("Metashape", lambda path: len(_documents(path)) == 1, _read_metashape)
+METASHAPE = Reader("Metashape", lambda path: len(files_with(path, *DOCUMENT)) == 1, _read_metashape)

@@ -25,11 +25,8 @@ def stages(config: StreamConfig) -> dict:
     c, mono_width = config.network.token_width, VITS[config.network.vit][0]
     at = lambda stride, channels: jnp.zeros((v, side // stride, side // stride, channels))  # noqa: E731
     vit_map = jnp.zeros((v, *grid_size(side, side), mono_width))
-    features = ReSplatFeatures(
-        cnn=(at(2, WIDTHS[0]), at(stride // 2, WIDTHS[1]), at(stride, WIDTHS[2])),
-        multiview=at(stride, WIDTHS[2]),
-        mono=(vit_map,) * 4,
-    )
+    cnn = (at(2, WIDTHS[0]), at(stride // 2, WIDTHS[1]), at(stride, WIDTHS[2]))
+    features = ReSplatFeatures(cnn=cnn, multiview=cnn[-1], mono=(vit_map,) * 4)
     sources, valid = jnp.zeros((v, 1), jnp.int32), jnp.ones(v, bool)
     context = at(4, sum(WIDTHS) + WIDTHS[2] + mono_width // 4)
     inside = jnp.ones((v, side // 4, side // 4), bool)
@@ -41,11 +38,6 @@ def stages(config: StreamConfig) -> dict:
         "mixer": (Mixer(config), (at(4, c), at(4, 3), inside, valid)),
         "decoder": (ReSplatGaussianHead(config), (jnp.zeros((1, c)),)),
     }
-
-
-def bound_history(feats: Float[Array, "v hf wf c"]) -> Float[Array, "v hf wf c"]:
-    """`feats` at unit RMS, because features of this network have no bound."""
-    return rms_normalize(feats)
 
 
 def mix_tokens(params, feats, positions, inside, view_valid, config: StreamConfig) -> Float[Array, "v hf wf c"]:
@@ -64,6 +56,6 @@ class ReSplatNetwork:
     match = staticmethod(match)
     refine_depth = staticmethod(refine_depth)
     regress_tokens = staticmethod(regress_tokens)
-    bound_history = staticmethod(bound_history)
+    bound_history = staticmethod(lambda feats: rms_normalize(feats))  # features of this network have no bound
     mix_tokens = staticmethod(mix_tokens)
     read_shapes = staticmethod(read_shapes)
