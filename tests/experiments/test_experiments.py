@@ -1,11 +1,16 @@
 """Experiments: what they compute from their measurements, and how the command line finds them."""
 
 from importlib.metadata import entry_points
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from ssplat_experiments import ablation
 from ssplat_experiments.accuracy_vs_time import mark_fronts
 from ssplat_experiments.depth_error import around_cells, near_edges, summary
+
+from ssplat_jax.config import preset
+from ssplat_jax.training.recipe import RECIPES
 
 
 def test_the_front_holds_undominated_settings():
@@ -15,6 +20,20 @@ def test_the_front_holds_undominated_settings():
     for a in rows:
         beaten = any(b["ms_per_view"] <= a["ms_per_view"] and b["shown"] >= a["shown"] and b is not a for b in rows)
         assert a["front"] != beaten
+
+
+def test_trainings_of_the_ablation_have_lpips_where_their_loss_has(monkeypatch):
+    given = []
+
+    def train(config, recipe, out, *, lpips_weights, **rest):
+        given.append(lpips_weights)
+        return SimpleNamespace(params={}, interrupted=None)
+
+    monkeypatch.setattr(ablation, "installed_lpips", lambda: "weights")
+    monkeypatch.setattr(ablation, "train", train)
+    for name in ("stream", "evidence", "depth"):
+        ablation.trained_by(preset("tiny"), RECIPES[name], {})
+    assert given == ["weights", "weights", None]
 
 
 def test_depth_errors_ignore_scale_and_are_binned():

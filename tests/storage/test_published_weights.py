@@ -26,6 +26,12 @@ def saved(path, **arrays):
     return path
 
 
+@pytest.mark.parametrize("name", ["paper", "small"])
+def test_published_weights_keep_the_depths_that_they_were_trained_with(name):
+    config = as_published(preset(name))
+    assert config.network.depth_range == (0.01, 200.0) and config.additions.depth_readout == "mean"
+
+
 def test_every_published_tensor_has_a_place_and_a_shape():
     ours = published_tensors(as_published(preset("small")))
     assert {t.name: t.shape for t in ours.values() if t is not None} == listed_tensors("resplat_small")
