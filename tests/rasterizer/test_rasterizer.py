@@ -173,6 +173,13 @@ def test_a_transform_that_hides_the_number_of_pairs_says_if_its_guess_was_too_lo
     assert f"max_pairs={1 << (counted - 1).bit_length()}" in said
 
 
+def test_the_guess_inside_jit_holds_four_tiles_of_every_gaussian():
+    gaussians, camera = cloud(3000, size=0.03), cameras(80, 96)
+    counted = int(render(gaussians, camera).num_pairs)
+    assert round_up(gaussians.num_gaussians) < counted <= 4 * gaussians.num_gaussians
+    assert int(jax.jit(lambda g: render(g, camera).num_overflow)(gaussians)) == 0
+
+
 @plainly
 @pytest.mark.slow  # the retry is tested forward in every run
 def test_gradients_outside_jit_include_every_pair():
