@@ -104,9 +104,10 @@ def test_a_frame_beyond_those_asked_for_is_not_missed(tmp_path, monkeypatch, cap
     whole = make_capture(tmp_path / "whole", num_frames=9, size=SIZE)
     (whole / "images" / "8.png").unlink()
     (whole / "done").touch()
-    for max_views, words in ((8, ""), (None, "left out")):
-        watched, stream = growing_capture(whole, max_views=max_views), Stream(monkeypatch)
+    for path, max_views, words in ((whole, 8, ""), (whole / "transforms.json", None, "left out")):
+        watched, stream = growing_capture(path, max_views=max_views), Stream(monkeypatch)
         watched.look()
+        assert watched.has_ended
         assert list(watched.chunks.__wrapped__(watched, stream, stream)) == [4, 4]
         assert words in (told := capsys.readouterr().err) and bool(words) == bool(told)
 
