@@ -46,6 +46,10 @@ ON_SURFACE = math.log(1.03)  # largest distance in log depth at which an observe
 MIN_REVISED, MAX_REVISED = 0.02, 0.95
 """Bounds of revised confidences: inside them a later vote can still change a confidence either way."""
 
+MOST_OBSERVED = 30.0
+"""Total weight of observations up to which the decoder tells pivots apart: nine pivots of ten had less in the streams
+that its evidence head learned from, and beyond it the head extrapolated."""
+
 
 @pytree
 class SeenCells:
@@ -286,7 +290,10 @@ def observation_features(observations: Float[Array, "n s"]) -> Float[Array, "n f
 
     Limits:
         Zeros, as for a pivot that no trusted cell has seen, give finite features. No gradient flows to observations.
+        Above a total weight of `MOST_OBSERVED` the counts grow no further; shares and means stay those of all views.
     """
+    most = MOST_OBSERVED / jnp.maximum(total_weight(observations), MOST_OBSERVED)
+    observations = observations * most[..., None]
     on, before, behind, error_on, error_before, offset, crowd, relative, size = jnp.moveaxis(
         jax.lax.stop_gradient(observations), -1, 0
     )

@@ -25,6 +25,9 @@ MIN_SCALE = 1e-6  # smallest scale, in stream units
 MAX_SCALE = 1.0  # largest scale, in stream units: ReSplat's bound
 MIN_DETAIL = {1: 0.05, 2: 0.018}
 """Least RMS color difference that parts of 1 or 2 pixels a side must show, to not become one of twice the side."""
+MOST_MEMBERS = 8
+"""Members up to which a pivot grows more opaque: few pivots had more in the streams that the evidence head learned from,
+and pivots of many members are no more often right than those."""
 VOXEL_COVERAGE = 1.2
 """Share of a voxel's face that its pivots cover together: above 1, because pivots gather in the middle of the voxel."""
 
@@ -69,7 +72,7 @@ def decode_tokens(
     """Gaussians of tokens or pivots: `gaussians_per_token` each, in a square over the cell, row by row.
 
     The Gaussians of a token share shape and opacity and differ in position and color. With `merged_coverage` a
-    pivot of n members is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n. With `detail` a cell
+    pivot of n members is as opaque as min(n, 8) Gaussians of opacity o at one place, 1 - (1 - o)^n. With `detail` a cell
     without detail has fewer and larger ones (`divide_cells`), in the first of the rows that they stand for; the other
     rows have opacity 0.
 
@@ -84,7 +87,7 @@ def decode_tokens(
         config: model configuration.
         rows: the rows of the result that are wanted, where not all are: what is left out costs nothing.
     """
-    layers = jnp.asarray(num_members, jnp.float32) if config.additions.merged_coverage else 1.0
+    layers = jnp.minimum(num_members, MOST_MEMBERS).astype(jnp.float32) if config.additions.merged_coverage else 1.0
     optical_depths = layers * nn.softplus(shapes.logit_opacities)
     g = config.head.gaussians_per_token
 
@@ -203,7 +206,7 @@ def evidence_features(evidence: Evidence, config: StreamConfig) -> Float[Array, 
     colors = evidence.rgbs.reshape(len(evidence.rgbs), -1, 3)
     features = (
         safe_log(omega) - jnp.log1p(-omega) - 2.0,
-        safe_log(jnp.maximum(evidence.num_members, 1.0)),
+        safe_log(jnp.clip(evidence.num_members, 1.0, MOST_MEMBERS)),
         safe_log(jnp.maximum(evidence.footprints, 1e-6) / config.memory.voxel_size),
         evidence.num_pivots - 2.5,
         safe_log(jnp.maximum(evidence.growth, 1.0)),

@@ -23,7 +23,7 @@ from ssplat_jax.cache.changes import changed_gaussians, unpack
 from ssplat_jax.cache.fuse import fuse
 from ssplat_jax.cache.project import ProjectedCache, coarsen, project, rows_in_sight
 from ssplat_jax.cache.state import Tokens, VoxelCache, init_cache
-from ssplat_jax.cache.votes import carve, observe, seen_cells, store_depths, vote
+from ssplat_jax.cache.votes import carve, observe, seen_cells, store_depths, total_weight, vote
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
@@ -266,9 +266,23 @@ class StreamSplat:
         return jnp.repeat(mask, self.config.head.gaussians_per_token)
 
 
+MIN_SHARE = 1 / 32
+"""Least members of a pivot over the weight of the views that saw it, to be shown beside a larger one of its voxel."""
+
+
 def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capacity k"]:
-    """Mask of the pivots that `decode` shows: alive and not carved away."""
-    return cache.alive & (cache.confidences >= config.memory.min_confidence)
+    """Mask of the pivots that `decode` shows: alive, not carved away and not outdone.
+
+    VACC merges the closest pair, so a token unlike all others stays a pivot of its own however often its voxel is seen
+    again. Where pivots keep observations, one with fewer members than `MIN_SHARE` of their weight gives way to the pivot
+    of its voxel that has most members (the first of equals), which is always shown.
+    """
+    is_shown = cache.alive & (cache.confidences >= config.memory.min_confidence)
+    if cache.observations is None or config.memory.vacc != "voxel":
+        return is_shown
+    members = jnp.where(is_shown, cache.num_members, 0)
+    is_largest = jnp.argmax(members, axis=1)[:, None] == jnp.arange(members.shape[1])
+    return is_shown & (is_largest | (members >= MIN_SHARE * total_weight(cache.observations)))
 
 
 def count_gaussians(cache: VoxelCache, config: StreamConfig) -> Int[Array, ""]:
