@@ -26,8 +26,8 @@ MAX_SCALE = 1.0  # largest scale, in stream units: ReSplat's bound
 MIN_DETAIL = {1: 0.05, 2: 0.018}
 """Least RMS color difference that parts of 1 or 2 pixels a side must show, to not become one of twice the side."""
 MOST_MEMBERS = 8
-"""Members up to which a pivot grows more opaque: few pivots had more in the streams that the evidence head learned from,
-and pivots of many members are no more often right than those."""
+"""Members up to which a pivot grows more opaque and the evidence head tells pivots apart: few had more in the streams
+that the head learned from."""
 VOXEL_COVERAGE = 1.2
 """Share of a voxel's face that its pivots cover together: above 1, because pivots gather in the middle of the voxel."""
 
@@ -71,10 +71,10 @@ def decode_tokens(
 ) -> Gaussians:
     """Gaussians of tokens or pivots: `gaussians_per_token` each, in a square over the cell, row by row.
 
-    The Gaussians of a token share shape and opacity and differ in position and color. With `merged_coverage` a
-    pivot of n members is as opaque as min(n, 8) Gaussians of opacity o at one place, 1 - (1 - o)^n. With `detail` a cell
-    without detail has fewer and larger ones (`divide_cells`), in the first of the rows that they stand for; the other
-    rows have opacity 0.
+    The Gaussians of a token share shape and opacity and differ in position and color. With `merged_coverage` a pivot of
+    n members, at most `MOST_MEMBERS`, is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n. With
+    `detail` a cell without detail has fewer and larger ones (`divide_cells`), in the first of the rows that they stand
+    for; the other rows have opacity 0.
 
     Args:
         shapes: what the head predicts. Rotations are in the frame of the token's camera, `shapes.sh` is added to the

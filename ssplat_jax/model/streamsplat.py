@@ -274,15 +274,16 @@ def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capaci
     """Mask of the pivots that `decode` shows: alive, not carved away and not outdone.
 
     VACC merges the closest pair, so a token unlike all others stays a pivot of its own however often its voxel is seen
-    again. Where pivots keep observations, one with fewer members than `MIN_SHARE` of their weight gives way to the pivot
-    of its voxel that has most members (the first of equals), which is always shown.
+    again. Where pivots keep observations, one with fewer members than `MIN_SHARE` of their weight gives way to the
+    pivot of its voxel that has most members (the first of equals), which is always shown.
     """
     is_shown = cache.alive & (cache.confidences >= config.memory.min_confidence)
     if cache.observations is None or config.memory.vacc != "voxel":
         return is_shown
     members = jnp.where(is_shown, cache.num_members, 0)
     is_largest = jnp.argmax(members, axis=1)[:, None] == jnp.arange(members.shape[1])
-    return is_shown & (is_largest | (members >= MIN_SHARE * total_weight(cache.observations)))
+    least = MIN_SHARE * total_weight(cache.observations)
+    return is_shown & (is_largest | (members.astype(jnp.float32) >= least))
 
 
 def count_gaussians(cache: VoxelCache, config: StreamConfig) -> Int[Array, ""]:

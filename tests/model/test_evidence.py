@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache.state import NUM_OBSERVED, init_cache
+from ssplat_jax.cache.votes import observation_features
 from ssplat_jax.config import preset
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model import decoder
 from ssplat_jax.model.network import init_params
-from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.model.streamsplat import StreamSplat, shown_pivots
 from ssplat_jax.model.views import TokenShapes
 from tests.model.small import random_params
 
@@ -127,3 +128,36 @@ def test_the_scene_has_the_contrast_that_the_head_asks_for():
     assert alive.sum() == 6
     gain = np.exp(decoder.MAX_LOG_CONTRAST * np.tanh(0.5 / decoder.MAX_LOG_CONTRAST))
     np.testing.assert_allclose((after - mean)[alive], gain * (before - mean)[alive], atol=2e-3)
+
+
+def test_the_head_is_asked_only_what_it_learned():
+    """More views and members than the streams had that it learned from count as those; shares and means stay."""
+    seen = jnp.asarray(np.random.default_rng(5).uniform(0.1, 1.0, (NUM, NUM_OBSERVED)), jnp.float32)
+    full = seen * 30 / seen[:, :3].sum(axis=1, keepdims=True)
+    features = jax.jit(observation_features)
+    for times in (1.5, 1e3, 1e30):
+        np.testing.assert_allclose(features(full * times), features(full), rtol=1e-5, atol=1e-5)
+    assert np.all(np.abs(features(full * 0.5) - features(full))[:, 0] > 0.3)
+    few, many, most = (
+        decoder.evidence_features(replace(evidence(), num_members=jnp.full(NUM, n)), CONFIG) for n in (7.0, 8.0, 1e9)
+    )
+    np.testing.assert_array_equal(many, most)
+    assert np.any(few != many)
+
+
+def test_a_pivot_that_views_outgrew_gives_way_to_the_largest_of_its_voxel():
+    rng, cache = np.random.default_rng(6), init_cache(CONFIG)
+    numbers = lambda *more: rng.integers(0, 5, (CONFIG.memory.capacity, *more)).astype(np.int32)  # noqa: E731
+    observations = (16 * numbers(4, NUM_OBSERVED)).astype(np.float32)
+    counts, members, confidences = numbers(), numbers(4) + 1, rng.choice([0.2, 0.5], (CONFIG.memory.capacity, 4))
+    facts = {"counts": counts, "num_members": members, "confidences": confidences, "observations": observations}
+    cache = replace(cache, **{name: jnp.asarray(x, getattr(cache, name).dtype) for name, x in facts.items()})
+    wanted = np.zeros(members.shape, bool)
+    for row, count in enumerate(counts):
+        left = [i for i in range(count) if confidences[row, i] >= CONFIG.memory.min_confidence]
+        largest = max(left, key=lambda i: members[row, i], default=None)  # the first of equals
+        for i in left:
+            wanted[row, i] = i == largest or 32 * members[row, i] >= observations[row, i, :3].sum()
+    np.testing.assert_array_equal(jax.jit(shown_pivots, static_argnums=1)(cache, CONFIG), wanted)
+    plain = CONFIG.replace(vacc="append")
+    np.testing.assert_array_equal(shown_pivots(cache, plain), cache.alive & (confidences >= 0.3))
