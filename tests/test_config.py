@@ -43,8 +43,7 @@ def test_bad_value_is_refused_by_name_and_value(changes):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_the_same_after_json(name):
-    text = json.dumps(preset(name).to_dict(), allow_nan=False)
-    again = StreamConfig.from_dict(json.loads(text))
+    again = StreamConfig.from_dict(json.loads(json.dumps(preset(name).to_dict(), allow_nan=False)))
     assert again == preset(name) and again.hash == preset(name).hash and hash(again) == hash(preset(name))
 
 

@@ -140,8 +140,7 @@ def remember(cache, tokens: Tokens):
     """The cache after tokens of views that contradict every pivot: all see far behind them, with full confidence."""
     maps = jnp.full(GRID, 19.0), jnp.ones(GRID), jnp.zeros(GRID), jnp.ones((2, 3))
     nothing = DepthDistribution(*jnp.zeros((3, *GRID, 1))), history(*jnp.zeros((2, *GRID)))
-    prediction = Prediction(tokens, *nothing, jnp.log(maps[0]), views(), ChunkOutput(*maps))
-    return UPDATE(cache, prediction)
+    return UPDATE(cache, Prediction(tokens, *nothing, jnp.log(maps[0]), views(), ChunkOutput(*maps)))
 
 
 UPDATE = jax.jit(MODEL.update_cache)

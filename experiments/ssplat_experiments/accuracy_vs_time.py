@@ -11,7 +11,6 @@ Time is chunk in -> one novel view out on the full cache, warm. Writes `table.js
 
 import dataclasses
 import functools
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,7 @@ from ssplat_experiments.settings import (
 from ssplat_experiments.streams import REDKITCHEN, open_redkitchen, open_room
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.core.console import Reporter
+from ssplat_jax.data.parsing import load_json
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
@@ -41,7 +41,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     if captures is None or not (captures / REDKITCHEN).is_dir():
         reporter.warn("no redkitchen under --captures: the procedural scene stands alone")
     path = out / "earlier.json"
-    earlier = json.loads(path.read_text()) if path.exists() else []
+    earlier = load_json(path, list) if path.exists() else []
     study = dataclasses.replace(STUDY, plot=functools.partial(plot, earlier=earlier))
     return run_study(study, captures, out, scale, reporter)
 

@@ -78,7 +78,8 @@ def render_reference(
         channels = jnp.concatenate([channels, jnp.ones_like(channels[..., :1])], axis=-1)
     xs, ys = (jnp.arange(size, dtype=channels.dtype) + 0.5 for size in (camera.width, camera.height))
     pixels = jnp.stack(jnp.broadcast_arrays(xs[None, :], ys[:, None]), axis=-1)
-    bands = [pixels[i : i + 16].reshape(-1, 2) for i in range(0, camera.height, 16)]  # of 16 rows: bounds the memory
+    rows = jnp.array_split(pixels, camera.height // 16 + 1)  # at most 16 at once: bounds the memory
+    bands = [part.reshape(-1, 2) for part in rows]
     images, medians = [], []
     for i in range(flat.viewmats.shape[0]):
         one = jax.tree.map(lambda x, i=i: x[i : i + 1], splats)

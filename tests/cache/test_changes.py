@@ -26,8 +26,7 @@ def settled(means, change):
 
 def pivots(seed: int, span: float, count: int = 256) -> jax.Array:
     """Places of pivots up to `span` voxels from the origin, some of them on faces of voxels."""
-    rng = np.random.default_rng(seed)
-    means = rng.uniform(-span, span, (count, 3)) * SIZE
+    means = np.random.default_rng(seed).uniform(-span, span, (count, 3)) * SIZE
     means[::5] = np.round(means[::5] / SIZE) * SIZE
     return jnp.asarray(means, jnp.float32)
 
@@ -85,9 +84,6 @@ def test_merges_of_changed_pivots_stay_in_their_voxels():
             np.testing.assert_array_equal(np.asarray(found)[alive], wanted[alive], f"chunk {seed}")
         cache = revised(cache, rng, REFINED)
     assert int(cache.stats.num_merged) > 20
-
-
-# Gaussians -----------------------------------------------------------------------------------------------------------
 
 
 def gaussians(count: int) -> Gaussians:

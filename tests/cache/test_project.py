@@ -89,9 +89,6 @@ def test_a_coarse_cell_equals_its_nearest_fine_cell():
         jax.tree.map(lambda c, f: np.testing.assert_array_equal(c[v, i, j], f[nearest]), coarse, fine)  # noqa: B023
 
 
-# Rows in sight --------------------------------------------------------------------------------------------------------
-
-
 def test_the_size_of_blocks_changes_nothing(monkeypatch):
     """Blocks so small that rows and pairs take many of them, the last one partly empty."""
     cache, camera = scenes.scene(7, CAPACITY - 3, 0.1), scenes.cameras(8)
@@ -99,8 +96,7 @@ def test_the_size_of_blocks_changes_nothing(monkeypatch):
 
     def passes(cache):
         carved = carve(cache, camera, cells, CONFIG).confidences
-        observed = observe(cache, camera, cells, CONFIG).observations
-        return project(cache, camera, CONFIG), carved, observed
+        return project(cache, camera, CONFIG), carved, observe(cache, camera, cells, CONFIG).observations
 
     whole = jax.jit(passes)(cache)
     assert np.any(whole[1] != cache.confidences) and np.any(whole[2] != 0)

@@ -184,9 +184,6 @@ def test_without_carving_nothing_is_computed():
     assert not jax.make_jaxpr(store_depths)(cache, scenes.front_camera(), seen(2.0)).eqns
 
 
-# Observations ---------------------------------------------------------------------------------------------------------
-
-
 def test_shards_see_what_the_whole_cache_sees():
     """Pivots of other shards crowd a cell too."""
     (whole, views), camera = random_scene(0, depth_spread=0.1), scenes.cameras(0)

@@ -107,8 +107,7 @@ def test_pictures_scores_and_the_viewer_draw_only_what_a_scene_calls_for(tmp_pat
         monkeypatch.setattr(module, "render", drawn)
     ss.save_ply(tmp_path / "scene.ply", splats)
     assert run("render", tmp_path / "scene.ply", capture, "--max-views", "1", "--out", tmp_path / "out", "--quiet") == 0
-    stream_frame = opened.stream_frame(ss.preset("tiny"))
-    scoring.score_view(splats, opened, 0, stream_frame, {})
+    scoring.score_view(splats, opened, 0, opened.stream_frame(ss.preset("tiny")), {})
     stage.draw(splats, "color", opened.frames[0].camtoworld, opened.K(0), (48, 32))
     assert degrees == [0, 0, 0]
 

@@ -14,8 +14,7 @@ HEIGHT, WIDTH = 5, 7
 
 def coordinates(seed: int = 0) -> np.ndarray:
     """Positions (x, y) `[d n 2]` inside the map, on samples, on the border and outside."""
-    rng = np.random.default_rng(seed)
-    coords = rng.uniform([-2, -2], [WIDTH + 1, HEIGHT + 1], (4, 15, 2))
+    coords = np.random.default_rng(seed).uniform([-2, -2], [WIDTH + 1, HEIGHT + 1], (4, 15, 2))
     coords[0, :3] = [[0, 0], [WIDTH - 1, HEIGHT - 1], [3, 2]]
     return coords
 

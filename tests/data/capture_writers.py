@@ -212,9 +212,6 @@ def write_metashape(root):
     (root / "cameras.xml").write_text(text)
 
 
-# Functions that change a capture that is written.
-
-
 def edit_text(file, change):
     """Writes what `change` makes of a text file; it must change it."""
 

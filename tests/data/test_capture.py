@@ -85,8 +85,7 @@ def test_names_that_are_not_utf8_have_digests():
     """Names on Linux are bytes; Python keeps the others as surrogates."""
     capture = smooth_capture(1)
     named = lambda name: dataclasses.replace(capture, frames=(dataclasses.replace(capture.frames[0], name=name),))  # noqa: E731
-    digests = [named(name).digest([0]) for name in ("caf\udce9.jpg", "caf\udcea.jpg", "caf.jpg")]
-    assert len(set(digests)) == 3
+    assert len({named(name).digest([0]) for name in ("caf\udce9.jpg", "caf\udcea.jpg", "caf.jpg")}) == 3
 
 
 def test_memory_does_not_grow_with_the_number_of_images(tmp_path):

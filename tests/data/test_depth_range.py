@@ -123,9 +123,6 @@ def test_range_is_bounded_and_scales(median, spread_near, spread_far):
     np.testing.assert_allclose([unit_near * scale, unit_far * scale], [near, far], rtol=1e-9)
 
 
-# -- real captures ----------------------------------------------------------------------------------------------------
-
-
 def test_kinect_depths_of_a_hand_held_video(captures):
     """The median is within 35 % of the Kinect's over the same frames, whose depths are inside [near, far]."""
     capture = open_capture(captures / "redkitchen", size=(320, 240))

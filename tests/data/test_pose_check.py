@@ -65,8 +65,7 @@ def test_options_of_the_path_read_files_in_any_convention(written, room, tmp_pat
 
 
 def test_inspect_names_the_flag_and_says_nothing_of_depths_from_wrong_poses(room):
-    turned = written_as(room, Convention(axes="opengl"))
-    warnings = summarize(turned, StreamConfig())["warnings"]
+    warnings = summarize(written_as(room, Convention(axes="opengl")), StreamConfig())["warnings"]
     assert sum("--axes opengl" in warning for warning in warnings) == 1
     assert not any("parallax" in warning or "matches between frames" in warning for warning in warnings)
 

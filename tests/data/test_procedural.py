@@ -73,8 +73,7 @@ def test_cameras_stay_in_free_space(kind, path):
 
 
 def test_clearance_is_the_distance_to_analytic_solids():
-    rng = np.random.default_rng(2)
-    b = SceneBuilder(rng, texture_library())
+    b = SceneBuilder(np.random.default_rng(2), texture_library())
     finish = Finish((0,))
     b.shell([0, 0, 0], [5, 5, 5], finish, finish, finish)
     b.dome(100.0, finish)
@@ -83,8 +82,7 @@ def test_clearance_is_the_distance_to_analytic_solids():
     b.add("cylinder", [0, 0, 3], [0.5, 1, 0.5], finish)
     scene = b.build(focus=[0, 0, 0], orbit_radius=1.0, eye=[0, 0, 0])
     points = np.array([[0, 0, 0], [2, -1, 0], [-2, 0, 0.9], [0, 0, 2], [4.9, 4, 4], [2, 0, 0], [0.0, 0, 6]])
-    wanted = [1.0, 0.5, 0.2, 0.5, 0.1, -0.5, -1.0]
-    np.testing.assert_allclose(clearance(scene, points), wanted, atol=1e-6)
+    np.testing.assert_allclose(clearance(scene, points), [1.0, 0.5, 0.2, 0.5, 0.1, -0.5, -1.0], atol=1e-6)
 
 
 def test_revisit_returns_to_places_that_it_saw_and_hardly_moves_there():

@@ -99,8 +99,7 @@ def test_solids_are_hit_at_their_analytic_depth(shape):
 def test_glowing_face_shows_its_texel_times_gain():
     """On a wall facing -z, u = 0 is at -x, so the dark half of the tile is on the left."""
     b = empty_builder()
-    picture = Finish((1,), tile=0.0, glow=1.0, gain=(0.5, 1.0, 0.25))
-    b.box([0, 0, 2.0], [2.0, 2.0, 0.1], picture)
+    b.box([0, 0, 2.0], [2.0, 2.0, 0.1], Finish((1,), tile=0.0, glow=1.0, gain=(0.5, 1.0, 0.25)))
     pose = look_at(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])).astype(np.float32)
     K = np.array([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]], np.float32)
     image = np.asarray(raycast(built(b), inverted(pose[None]), K, HEIGHT, WIDTH)[0])[0]

@@ -54,8 +54,7 @@ def test_paper_laws(num_frames, context, targets, anchors):
 def test_a_capture_of_any_length_has_a_split(protocol, num_frames):
     split = choose_split(protocol, num_frames, None, None)
     assert 1 <= len(split.context) <= 64 and len(split.targets) >= 1
-    used = len(split.context) + len(split.targets)
-    assert used >= min(73, num_frames)  # of a short capture every frame
+    assert len(split.context) + len(split.targets) >= min(73, num_frames)  # of a short capture every frame
     if protocol == "interleaved":
         assert split.context[-1] >= 0.5 * num_frames - 1  # the context reaches over most of the trajectory
 

@@ -34,8 +34,7 @@ def test_a_frames_own_intrinsics_come_first(tmp_path):
         frame(2, camera_angle_x=angle, camera_angle_y=angle),
         frame(3, camera_angle_x=angle),
     )
-    wanted = [(WIDTH, 70, 10), (50, 51, 31), (WIDTH, HEIGHT, 31), (WIDTH, WIDTH, 31)]
-    for i, (fx, fy, cx) in enumerate(wanted):
+    for i, (fx, fy, cx) in enumerate([(WIDTH, 70, 10), (50, 51, 31), (WIDTH, HEIGHT, 31), (WIDTH, WIDTH, 31)]):
         np.testing.assert_allclose(capture.K(i), [[fx, 0, cx], [0, fy, 25], [0, 0, 1]], rtol=1e-14)
 
 
@@ -64,8 +63,7 @@ def test_the_longer_side_determines_the_shrink_factor(tmp_path, turned):
             Image.new("RGB", stored).save(path)
         meta.update(w=wanted[0], h=wanted[1], fl_x=1500.0, fl_y=1500.0, cx=wanted[0] / 2, cy=wanted[1] / 2)
 
-    K = opened(tmp_path, describe).K(0)
-    np.testing.assert_allclose(K[[0, 1], [0, 1]], 1500 / 8)
+    np.testing.assert_allclose(opened(tmp_path, describe).K(0)[[0, 1], [0, 1]], 1500 / 8)
 
 
 def test_names_without_an_order_keep_the_order_of_the_file(tmp_path):
@@ -88,5 +86,4 @@ def test_frames_are_ordered_by_poses_in_their_own_convention(tmp_path):
             meta["frames"][i]["transform_matrix"] = written.from_opencv(pose).tolist()
 
     root = make_capture(tmp_path / "c", change, num_frames=len(names))
-    capture = open_capture(f"{root}?poses=world-to-camera")
-    assert [frame.name[7] for frame in capture.frames] == list(names)
+    assert [frame.name[7] for frame in open_capture(f"{root}?poses=world-to-camera").frames] == list(names)

@@ -89,13 +89,11 @@ def test_nearness_counts_centers_and_angles(capture):
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[1:3, 0, 3] = 2.0, 0.5
     poses[3:, :3, :3] = [rodrigues([0, 1, 0], angle) for angle in (0.4, 1.3)]
-    turned = with_poses(capture, poses)
-    assert nearest_views(turned, 0, (1, 2, 3, 4)) == [2, 3, 1, 4]  # 0.25, 0.4, 1.0, 1.3
+    assert nearest_views(with_poses(capture, poses), 0, (1, 2, 3, 4)) == [2, 3, 1, 4]  # 0.25, 0.4, 1.0, 1.3
 
 
 def test_the_baselines_copy_the_nearest_view_and_show_the_mean_color(capture):
-    split = Split("given", context=(0, 4), targets=(1, 3))
-    found = baselines(capture, split)
+    found = baselines(capture, Split("given", context=(0, 4), targets=(1, 3)))
     copies = [psnr(capture.image(near), capture.image(i)) for near, i in ((0, 1), (4, 3))]
     assert found["nearest_view_psnr"] == pytest.approx(np.mean(copies), abs=1e-4)
     mean = np.mean([capture.image(0), capture.image(4)], axis=(0, 1, 2))

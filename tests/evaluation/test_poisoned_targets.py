@@ -58,8 +58,7 @@ def evaluated(capture, causal, out, monkeypatch):
 @pytest.mark.parametrize("causal", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_poisoned_targets_change_nothing_but_scores(causal, capture, tmp_path, monkeypatch):
     facts, arrays = evaluated(capture, causal, tmp_path / "clean", monkeypatch)
-    other = poisoned(capture, SPLIT.targets, np.nan)
-    got, there = evaluated(other, causal, tmp_path / "poisoned", monkeypatch)
+    got, there = evaluated(poisoned(capture, SPLIT.targets, np.nan), causal, tmp_path / "poisoned", monkeypatch)
     assert got == facts
     assert_same_bits(there, arrays)
 

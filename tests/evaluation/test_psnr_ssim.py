@@ -14,8 +14,7 @@ SSIM_SIGMA = 1.5
 
 def image(seed: int, height: int = 24, width: int = 31) -> np.ndarray:
     """Blocky noise in [0, 1], with structure at the scale of the window."""
-    rng = np.random.default_rng(seed)
-    coarse = rng.uniform(size=(height // 4 + 2, width // 4 + 2, 3))
+    coarse = np.random.default_rng(seed).uniform(size=(height // 4 + 2, width // 4 + 2, 3))
     return np.repeat(np.repeat(coarse, 4, axis=0), 4, axis=1)[:height, :width].astype(np.float32)
 
 

@@ -49,9 +49,6 @@ def test_no_product_takes_subsampled_pixels():
     assert not [e for e in program.eqns if e.primitive.name == "dot_general" and taken & set(e.invars)]
 
 
-# Untrained parameters -------------------------------------------------------------------------------------------------
-
-
 KEY = jax.random.key(7)
 OFF = NARROW.replace(cgfi=False, mixer_blocks=0)
 

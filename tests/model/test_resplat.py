@@ -17,8 +17,7 @@ CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0
 
 
 def test_resize_keeps_corners_and_interpolates_linearly():
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(2, 5, 7, 3)).astype(np.float32)
+    x = np.random.default_rng(0).normal(size=(2, 5, 7, 3)).astype(np.float32)
     for height, width in ((5, 7), (9, 13), (3, 4), (16, 11), (1, 1)):
         rows, columns = np.linspace(0, 4, height), np.linspace(0, 6, width)
         wanted = np.empty((2, height, width, 3))
@@ -29,8 +28,7 @@ def test_resize_keeps_corners_and_interpolates_linearly():
 
 
 def test_position_codes_are_resampled_as_by_dinov2():
-    rng = np.random.default_rng(0)
-    codes = jnp.asarray(rng.normal(size=(1, 1 + POSITIONS_SIDE**2, 2)), jnp.float32)
+    codes = jnp.asarray(np.random.default_rng(0).normal(size=(1, 1 + POSITIONS_SIDE**2, 2)), jnp.float32)
     np.testing.assert_array_equal(resampled_positions(codes, 37, 37), codes[:, 1:])
     np.testing.assert_allclose(resampled_positions(jnp.ones_like(codes), 9, 50), 1.0, atol=1e-5)
     # Keys' cubic convolution with a = -0.75 (JAX has -0.5), at positions for a factor of (size + 0.1) / 37.

@@ -32,8 +32,7 @@ def scene(num_cameras=10, num_points=150, noise=0.0, false_share=0.0, seed=0):
 
 def disturbed(observations, degrees=0.5, shift=0.01, seed=1):
     """The observations from cameras whose poses are a little wrong."""
-    rng = np.random.default_rng(seed)
-    twists = rng.normal(size=(len(observations.Ks), 2, 3))
+    twists = np.random.default_rng(seed).normal(size=(len(observations.Ks), 2, 3))
     twists /= np.linalg.norm(twists, axis=2, keepdims=True)
     twists = np.concatenate([np.radians(degrees) * twists[:, 0], shift * twists[:, 1]], axis=1)
     return dataclasses.replace(observations, viewmats=moved(observations.viewmats, twists))
@@ -69,8 +68,7 @@ def test_poses_stay_around_the_given_ones():
     """The cameras together could turn and move as they like: the prior alone keeps them."""
     exact, _ = scene()
     wrong = disturbed(exact)
-    found = adjust(wrong, SCALES, DEVIATIONS)
-    after = moved(wrong.viewmats, found.twists)
+    after = moved(wrong.viewmats, adjust(wrong, SCALES, DEVIATIONS).twists)
     drift = Rotation.from_matrix(after[:, :3, :3] @ exact.viewmats[:, :3, :3].transpose(0, 2, 1)).mean()
     assert np.degrees(drift.magnitude()) < 0.5 / np.sqrt(len(exact.Ks)) * 1.5
 

@@ -80,8 +80,7 @@ def test_an_array_that_is_absent_adds_no_operation(name):
 
 
 def test_distortion_follows_opencvs_formula_and_derivative():
-    random = np.random.default_rng(0)
-    x, y = random.uniform(-0.5, 0.5, (2, 1, 50))
+    x, y = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 1, 50))
     k1, k2, p1, p2, k3 = LENS.astype(float)
 
     def opencv(x, y):

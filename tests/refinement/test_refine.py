@@ -145,8 +145,7 @@ def test_the_first_step_of_adam_is_the_rate_against_the_gradient():
 
 def test_a_step_averages_the_gradients_of_its_views():
     """A step on two views has the mean of the gradients that steps on one view each have."""
-    both = jnp.array([True, False, True, False])
-    state, report = step(first_state(), replace(key_views(), valid=both))
+    state, report = step(first_state(), replace(key_views(), valid=jnp.array([True, False, True, False])))
     assert sorted(np.asarray(report.views)) == [0, 2]
     singles, losses = [], []
     for view in (0, 2):
@@ -160,8 +159,7 @@ def test_a_step_averages_the_gradients_of_its_views():
 
 
 def test_a_step_that_is_not_finite_changes_only_its_count():
-    views = key_views(exposures=jnp.full((NUM_VIEWS, 3), jnp.nan))
-    state, _ = step(first_state(), views)
+    state, _ = step(first_state(), key_views(exposures=jnp.full((NUM_VIEWS, 3), jnp.nan)))
     assert_same_bits(current(state), with_sh_degree(doubtful(), 1))
     assert int(state.num_skipped) == 1 and int(state.num_steps) == 1
     assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves((state.change, state.adam)))

@@ -52,7 +52,6 @@ def test_up_is_that_of_level_cameras_though_some_lie_on_a_side(share):
     level = [[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]]  # right, down and forward at angle 90 degrees
     given = np.tile(np.eye(4), (40, 1, 1))
     given[:, :3, :3] = Rotation.from_rotvec(angles[:, None] * up).as_matrix() @ np.transpose(level)
-    quarter_turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    given[: round(share * 40), :3, :3] @= quarter_turn
+    given[: round(share * 40), :3, :3] @= Rotation.from_euler("z", 90, degrees=True).as_matrix()
     found = upward(given)
     assert found is not None and np.degrees(np.arccos(min(1.0, found @ up))) < 1.0

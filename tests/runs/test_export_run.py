@@ -79,8 +79,7 @@ def test_up_points_along_an_axis_of_the_file(tmp_path, suffix):
 def test_a_sog_holds_the_camera_to_start_with(tmp_path):
     pose = np.eye(4)
     pose[:3, 3] = [0.5, 0.0, -1.0]
-    views = views_from(np.stack([pose] * 3))
-    export_scene(scene(0), tmp_path / "a.sog", views)
+    export_scene(scene(0), tmp_path / "a.sog", views_from(np.stack([pose] * 3)))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         start = json.loads(archive.read("meta.json"))["cameras"][0]["initial"]
     assert start["position"] == [0.5, 0.0, -1.0] and start["target"][:2] == [0.5, 0.0] and start["target"][2] > 1.0
@@ -91,8 +90,7 @@ def test_an_export_says_how_a_plain_renderer_shows_the_file(tmp_path):
     """A wall with a hole, and a view at twice the exposure of the file."""
     x, y = np.meshgrid(np.linspace(-1.6, 1.6, 60), np.linspace(-1.1, 1.1, 40))
     means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=1)
-    means = means[np.hypot(means[:, 0], means[:, 1]) > 0.5]
-    wall = balls(means, 0.04, 0.99, 0.4)
+    wall = balls(means[np.hypot(means[:, 0], means[:, 1]) > 0.5], 0.04, 0.99, 0.4)
     views = views_from(np.tile(np.eye(4), (3, 1, 1)), np.array([[1.0] * 3, [2.0] * 3, [1.0] * 3]))
     _, turn = export_scene(wall, tmp_path / "a.ply", views)
     words = difference_in_words(tmp_path / "a.ply", views, turn)

@@ -25,8 +25,7 @@ def test_safe_normalize_of_zero_is_zero_with_a_zero_gradient(size):
 @pytest.mark.parametrize("size", [1.1e-10, 1e-5, 1.0, 1e10, 0.9e30])
 @pytest.mark.parametrize("width", [2, 3, 4, 32])
 def test_safe_normalize_length_is_one_within_four_ulp(size, width):
-    rng = np.random.default_rng(width)
-    x = rng.uniform(-1, 1, (500, width))
+    x = np.random.default_rng(width).uniform(-1, 1, (500, width))
     x = x / np.abs(x).max(-1, keepdims=True) * size
     unit = np.asarray(safe_normalize(jnp.asarray(x, jnp.float32)), np.float64)
     assert np.abs(np.linalg.norm(unit, axis=-1) - 1).max() < 4 * ULP

@@ -278,8 +278,7 @@ def test_an_exposure_that_is_not_finite_corrects_nothing(bad):
     color = jnp.asarray(np.random.default_rng(0).uniform(size=(2, 4, 5, 3)), jnp.float32)
     exposures = jnp.stack([jnp.eye(3, 4).at[1, 3].set(bad), 2.0 * jnp.eye(3, 4)])
     np.testing.assert_allclose(apply_exposures(color, exposures), [color[0], 2.0 * color[1]], rtol=1e-6)
-    slopes = jax.jit(jax.grad(lambda *x: apply_exposures(*x).sum(), (0, 1)))
-    by_color, by_exposures = slopes(color, exposures)
+    by_color, by_exposures = jax.jit(jax.grad(lambda *x: apply_exposures(*x).sum(), (0, 1)))(color, exposures)
     np.testing.assert_allclose(by_color, [jnp.ones_like(color[0]), 2.0 * jnp.ones_like(color[1])], rtol=1e-6)
     assert not by_exposures[0].any() and np.isfinite(by_exposures).all() and by_exposures[1].any()
 

@@ -23,8 +23,7 @@ FLOAT32 = 5e-6
 
 @jax.jit
 def rotated(quats, points):
-    matrices = quats_to_matrices(quats)
-    poses = jnp.zeros((len(quats), 4, 4)).at[:, :3, :3].set(matrices).at[:, 3, 3].set(1.0)
+    poses = jnp.zeros((len(quats), 4, 4)).at[:, :3, :3].set(quats_to_matrices(quats)).at[:, 3, 3].set(1.0)
     return transform_points(poses, points[:, None])[:, 0]
 
 

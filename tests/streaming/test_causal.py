@@ -132,9 +132,6 @@ def test_a_continued_cache_needs_its_frame_to_be_pushed_to(capture, start):
         push(start(MODEL.init_cache()), capture, [0])
 
 
-# Near and far ---------------------------------------------------------------------------------------------------------
-
-
 def at_depths(*shares):
     """An output whose cells have depths in the given shares, all confident."""
     depths = np.concatenate([np.full(round(1000 * share), depth) for share, depth in shares]).reshape(1, 1, -1)
@@ -168,9 +165,6 @@ def test_the_range_stops_at_its_largest_ratio(capture):
     # A range that is wider from the start stays as it is.
     wide = dataclasses.replace(frame, near=0.01, far=200.0)
     assert widen_range(wide, at_depths((1.0, 200.0)), CAUSAL).far == 200.0
-
-
-# Interrupts -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("place", ["framing", "compiling", "waiting"])

@@ -74,8 +74,7 @@ def test_a_delta_holds_the_changed_rows_alone(monkeypatch):
     assert set(feed.update(cache).rows) == written_rows(cache)  # a failed update is made up for
     assert len(feed.update(cache).rows) == 0
     row = int(jnp.argmax(jnp.max(cache.confidences, axis=1)))
-    sunk = replace(cache, confidences=cache.confidences.at[row].set(0.1))
-    assert feed.update(sunk).rows.tolist() == [row]
+    assert feed.update(replace(cache, confidences=cache.confidences.at[row].set(0.1))).rows.tolist() == [row]
     assert feed.update(cache).rows.tolist() == [row]
     # A receiver who has the scene of a known cache needs the rest, also where no pivot comes or goes.
     for _ in range(4):  # until every voxel is full

@@ -184,8 +184,7 @@ def steps(mesh, config, params, chunks, num_new_tokens):
         history.append(everywhere(mesh, (caches, output)))
     check_cache(caches, sharded.model.config)
     grown = sharded.ensure_capacity(caches, num_new_tokens)
-    scenes = jax.jit(sharded.decode)(params, caches)
-    return history, step._cache_size(), *everywhere(mesh, (scenes, grown))
+    return history, step._cache_size(), *everywhere(mesh, (jax.jit(sharded.decode)(params, caches), grown))
 
 
 def on_mesh(mesh, spec, tree):

@@ -103,8 +103,7 @@ def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(
     (phase,), rng = RECIPES["paper"].phases, np.random.default_rng(3)
     gaussians = cloud(9, degree=0, size=0.3)
     viewmats = jnp.tile(jnp.eye(4), (4, 1, 1)).at[:, 0, 3].set(jnp.linspace(-0.3, 0.3, 4))
-    K = jnp.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]])
-    cameras = Camera(viewmats, jnp.tile(K, (4, 1, 1)), 16, 12)
+    cameras = Camera(viewmats, jnp.tile(jnp.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]]), (4, 1, 1)), 16, 12)
     colors = np.asarray(jax.jit(render_reference)(gaussians, cameras).color, np.float64)
     targets = 0.5 * colors + 0.1 * rng.uniform(size=colors.shape)
     sample = sample_of(jnp.zeros((1, 4, 2, 2)), jnp.asarray(targets, jnp.float32), cameras, is_photographed=True)
@@ -185,14 +184,12 @@ def test_the_anchor_learns_where_the_cache_is_right():
         params, state, metrics = step(params, state)
     assert float(metrics["l1"]) < 0.25 * float(metrics["l1_of_matcher"])
     # Holes of the cache and unknown depths do not count.
-    known = np.s_[:, :, 1:, 1:]
-    wanted = np.abs(0.1 * (matched - truth))[known].mean()
+    wanted = np.abs(0.1 * (matched - truth))[np.s_[:, :, 1:, 1:]].mean()
     assert float(metrics["l1_of_matcher"]) == pytest.approx(wanted, rel=0.1)
 
 
 def test_fitted_gains_undo_exposures_and_stay_bounded():
-    rng = np.random.default_rng(0)
-    images = jnp.asarray(rng.uniform(0.1, 0.9, (3, 6, 5, 3)), jnp.float32)
+    images = jnp.asarray(np.random.default_rng(0).uniform(0.1, 0.9, (3, 6, 5, 3)), jnp.float32)
     true = np.array([[0.7, 1.0, 1.4], [5.0, 0.01, 1.2]], np.float32)
     targets = jnp.concatenate([images[:2] * true[:, None, None], images[2:]])
     images = images.at[2].set(0.0)

@@ -181,8 +181,7 @@ def test_masks_of_a_capture_are_masks_of_its_samples(capture):
     shares = [np.mean(sample.target_seen) for sample in drawn]
     assert 1.0 in shares and min(shares) < 1
     hidden = next(sample for sample in drawn if not sample.chunks.seen.all())
-    seen = np.concatenate([hidden.chunks.seen.reshape(-1, *SIZE), hidden.target_seen.reshape(-1, *SIZE)])
-    for view in seen:
+    for view in np.concatenate([hidden.chunks.seen.reshape(-1, *SIZE), hidden.target_seen.reshape(-1, *SIZE)]):
         assert view.all() or not view[6:14].any()
 
 

@@ -156,8 +156,7 @@ def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
     colors, at = [[0.9, 0.2, 0.1], [0.1, 0.3, 0.9]], pose(0.1)
     viewed = balls([[-0.6, 0, 2], [0.6, 0, 2.1]], [0.6, 0.6, 0.01], 0.99, colors)  # flat, side by side
     viewmats, Ks = (jnp.asarray(x, jnp.float32) for x in (np.linalg.inv(at), K))
-    view = Camera(viewmats=viewmats, Ks=Ks, width=48, height=32)
-    out = ss.render(viewed, view)
+    out = ss.render(viewed, Camera(viewmats=viewmats, Ks=Ks, width=48, height=32))
     wanted = np.clip(fill_holes(out.color, out.alpha, mean_color(viewed)), 0, 1)
     found = draw(viewed, "color", at, K, SIZE)
     np.testing.assert_allclose(found / 255, wanted, atol=0.51 * LEVEL)
@@ -205,8 +204,7 @@ def test_a_run_of_other_poses_is_seen_from_its_own_start(tmp_path):
         assert client.nodes["/scene"] is node and not node.removed and node.num_updates == 1
         assert stage.start is start and (stage.unit, stage.distance) == units
         np.testing.assert_array_equal(client.camera.position, 9.0)
-        other = dataclasses.replace(first, origin=np.array([1.0, 2.0, 3.0]), far=32.0)
-        restarted(folder, other, size=0.5)
+        restarted(folder, dataclasses.replace(first, origin=np.array([1.0, 2.0, 3.0]), far=32.0), size=0.5)
         assert stage.refresh() and stage.num_starts == 2
         viewer.update()
         sent = client.nodes["/scene"]

@@ -34,8 +34,7 @@ def test_splats_equal_the_gaussians_in_16_bits_at_any_size(size):
     unit = median_size(gaussians)
     splats = visible_splats(gaussians, unit, max_gaussians=1000)
     rotations = Rotation.from_quat(np.asarray(gaussians.quats)[:, [1, 2, 3, 0]]).as_matrix()
-    variances = np.asarray(gaussians.scales, np.float64) ** 2
-    wanted = np.einsum("nij,nj,nkj->nik", rotations, variances, rotations)
+    wanted = np.einsum("nij,nj,nkj->nik", rotations, np.asarray(gaussians.scales, np.float64) ** 2, rotations)
     largest = np.abs(wanted).max(axis=(1, 2), keepdims=True)
     sent = splats["covariances"].astype(np.float16).astype(np.float64) * unit**2
     np.testing.assert_allclose(sent / largest, wanted / largest, atol=2 * HALF_PRECISION)
@@ -74,8 +73,7 @@ def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
     assert source.changed() is None and source.stream_frame() is None
     deltas = [delta([0, 1], 1), delta([1, 2, 5], 2), delta([0], 3)]
     save_delta(tmp_path / "deltas" / "000004.npz", deltas[0], stream)
-    first = source.changed()
-    assert first is not None and source.changed() is None
+    assert source.changed() is not None and source.changed() is None
     for number, more in enumerate(deltas[1:], start=2):
         save_delta(tmp_path / "deltas" / f"{4 * number:06d}.npz", more, stream)
     found = source.changed()
@@ -123,8 +121,7 @@ def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeyp
 
     monkeypatch.setattr("ssplat_jax.viewer.stage.load_delta", vanish)
     assert source.changed() is None
-    found = source.changed()
-    np.testing.assert_array_equal(found.opacities[:4], delta([0, 1], 1).gaussians.opacities)
+    np.testing.assert_array_equal(source.changed().opacities[:4], delta([0, 1], 1).gaussians.opacities)
     (tmp_path / "deltas" / "000012.npz").write_bytes(b"damaged")
     with pytest.raises(StorageError, match=r"000012\.npz"):
         source.changed()
