@@ -87,7 +87,7 @@ def test_a_crop_shows_what_the_whole_scene_shows_there(trained):
         scenes = everything, decode(pivots)
         wanted, got = (render(x, camera, effects=crops.EFFECTS, max_pairs=1 << 15) for x in scenes)
         assert int(wanted.num_overflow) == 0
-        np.testing.assert_allclose(got.color, wanted.color, atol=2e-4)  # Gaussians of one depth may change places
+        np.testing.assert_allclose(got.color, wanted.color, atol=1e-3)  # Gaussians at one depth may change places
         num_left_out += int((everything.opacities > 0).sum()) - count[1]
     assert num_left_out > 0
 
