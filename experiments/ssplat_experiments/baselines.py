@@ -23,8 +23,6 @@ from ssplat_jax.evaluation.scoring import ImageScore, exposure_for, nearest_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Exposures
 
-BASELINES = ("copy nearest", "mean color", "warp nearest")
-
 
 def baseline_scores(
     capture: Capture,
@@ -99,13 +97,9 @@ def warp(
     return np.where(known[..., None], np.stack(channels, axis=-1), 0.0).astype(np.float32), known
 
 
-SMALLEST_CAPACITY = 128
-
-
 def joint_config(config: StreamConfig, num_views: int) -> StreamConfig:
     """`config` with all views in one chunk and nothing that reads a memory."""
-    changes = {"chunk_size": num_views, "hpda": False, "cgfi": False, "carving": False}
-    return config.replace(**changes, capacity=SMALLEST_CAPACITY)
+    return config.replace(chunk_size=num_views, hpda=False, cgfi=False, carving=False)
 
 
 class JointNetwork:

@@ -21,14 +21,15 @@ import numpy as np
 from ssplat_experiments.baselines import JointNetwork, baseline_scores, joint_config, one_chunk
 from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.streams import START_CAPACITY, new_session
-from ssplat_experiments.study import OOM, Study, at_scale, run_study
+from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.core.errors import is_out_of_memory
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, paper_split
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.cost import measure_latency, peak_memory
+from ssplat_jax.evaluation.cost import OOM, measure_latency, peak_memory
 from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import ImageScore, mean_images, score_view
 from ssplat_jax.storage.weights import load_params
@@ -123,7 +124,7 @@ def until_full(found: Iterator[list[Row]], counts: Sequence[int], place: Row) ->
         try:
             rows += [here | row for row in next(found)]
         except RuntimeError as error:
-            if "RESOURCE_EXHAUSTED" not in str(error):
+            if not is_out_of_memory(error):
                 raise
             return [*rows, here | {"peak_memory_bytes": OOM}]
     return rows

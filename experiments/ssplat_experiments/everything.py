@@ -8,16 +8,11 @@ Each runs in its folder below `results/`; `results.md` holds the pages of all. A
 from pathlib import Path
 
 from ssplat_experiments import ablation, accuracy_vs_time, context_length, cost
-from ssplat_experiments.study import PAGE, Study, run_study
+from ssplat_experiments.study import PAGE, run_study
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
 
-STUDIES: tuple[Study, ...] = (
-    context_length.STUDY,
-    cost.STUDY,
-    accuracy_vs_time.STUDY,
-    ablation.STUDY,  # last: it trains
-)
+STUDIES = (context_length.STUDY, cost.STUDY, accuracy_vs_time.STUDY, ablation.STUDY)  # the last one trains
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:

@@ -2,30 +2,33 @@
 
     ssplat experiment score --captures path/to/capture --renders path/to/renders --out runs/score
 
-The folder of renders holds `split.json`, as `ssplat eval` writes it, and one image for each target, named by its frame:
-`00004.png`, or `000004.png` as pixelSplat and its heirs write it. All images have one size, at which the capture is
-read. Scores are literal: the pixels as they are, no holes filled and no exposure changed. The nearest context view and
-the mean color stand beside them. The row shows the `peak_memory_bytes` of `metrics.json`, as `ssplat eval` writes it,
-where the folder holds one; "OOM" there stands for a method that had no memory for the scene, and needs no images. Of
-many scenes both folders hold one folder for each, and the means over views, then scenes, come last.
+The folder of renders holds `split.json`, as `ssplat eval` writes it, and one image for each target, named by its frame
+(`00004.png`; the `color` of pixelSplat and its heirs) or by its place among the targets (`0.png` on; the `rendering` of
+Long-LRM, the `pred` of AnySplat). All images have one size, at which the capture is read. Scores are literal: the
+pixels as they are, no holes filled and no exposure changed. The nearest context view and the mean color stand beside
+them. The row shows the `peak_memory_bytes` of `metrics.json`, as `ssplat eval` writes it, where the folder holds one;
+"OOM" there stands for a method that had no memory for the scene, and needs no images. Of many scenes both folders hold
+one folder for each, and the means over views, then scenes, come last.
 """
 
 import functools
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ssplat_experiments.cases import Case, Row
-from ssplat_experiments.study import OOM, Study, run_study
+from ssplat_experiments.study import Study, run_study
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.images import decode_image, image_size
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
+from ssplat_jax.evaluation.cost import OOM
 from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import check_scorable, mean_images, nearest_views, score_image
 
@@ -67,12 +70,11 @@ def case_of(method: str, path: str, renders: Path, name: str | None = None) -> C
         asked = {"capture": path, "split": split.sha256[:12], "peak_memory_bytes": OOM}
         row = {"method": method, "capture": Path(path).name, "peak_memory_bytes": OOM}
         return Case(name or method, None, asked, lambda: [row])
-    files = {i: _file_of(renders, i) for i in split.targets}
+    files = files_of(renders, split.targets)
     sizes = {image_size(file) for file in files.values()}
     if len(sizes) != 1:
-        raise InputError(
-            f"{renders}: wanted renders of one size, got {', '.join(f'{w}x{h}' for w, h in sorted(sizes))}."
-        )
+        got = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        raise InputError(f"{renders}: wanted renders of one size, got {got}.")
     capture = open_capture(path, size=sizes.pop())
     check_scorable(capture, with_lpips=installed_lpips() is not None)
     if max(*split.context, *split.targets) >= len(capture):
@@ -157,12 +159,19 @@ def read_memory(path: Path) -> int | str | None:
     return found
 
 
-def _file_of(folder: Path, i: int) -> Path:
-    """The image of a target."""
-    found = [
-        path for end in SUFFIXES for name in (f"{i:05d}", f"{i:06d}") if (path := folder / f"{name}{end}").is_file()
-    ]
-    if len(found) != 1:
-        got = "none" if not found else " and ".join(path.name for path in found)
-        raise InputError(f"{folder}: wanted one image {i:05d}.png of target {i}, got {got}.")
-    return found[0]
+def files_of(folder: Path, targets: Sequence[int]) -> dict[int, Path]:
+    """The image of each target, whose name is its frame, or its place among the targets if all names are places.
+
+    Raises:
+        InputError: a target has no image, or more than one.
+    """
+    found = [path for path in sorted(folder.iterdir()) if path.suffix in SUFFIXES and path.stem.isdecimal()]
+    places = sorted(int(path.stem) for path in found) == list(range(len(targets)))
+    files = {}
+    for place, i in enumerate(targets):
+        here = [path for path in found if int(path.stem) == (place if places else i)]
+        if len(here) != 1:
+            got = " and ".join(path.name for path in here) or "none"
+            raise InputError(f"{folder}: wanted one image {i:05d}.png of target {i}, got {got}.")
+        files[i] = here[0]
+    return files

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from ssplat_experiments.cases import PICTURE, Case, Row, measure_cases
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.evaluation.cost import commit
+from ssplat_jax.evaluation.cost import OOM, commit
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import make_writable
 
@@ -22,7 +22,6 @@ T = TypeVar("T")
 SCALES = ("smoke", "cpu", "gpu")  # sizes of an experiment: seconds, two cores, a GPU
 
 PAGE, PLOT = "page.md", "plot.png"
-OOM = "OOM"  # peak memory in a row of what did not fit into the memory of the machine
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,7 @@ from ssplat_jax.commands.measure_commands import Bench, Experiment
 from ssplat_jax.commands.program_cache import keep_no_programs, keep_programs
 from ssplat_jax.commands.scene_commands import Export, Inspect, Poses, View
 from ssplat_jax.commands.weights_commands import ImportWeights, Train, Weights
-from ssplat_jax.core.errors import CacheError, InputError
+from ssplat_jax.core.errors import CacheError, InputError, is_out_of_memory
 from ssplat_jax.runs.stream_commands import Demo, Eval, Refine, Render, Run
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
@@ -108,8 +108,7 @@ def guarded(run: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         return _refuse("interrupted", 130)
     except Exception as error:
-        # XLA reports an exhausted device as a RuntimeError of its own that starts with this word.
-        if "RESOURCE_EXHAUSTED" in str(error):
+        if is_out_of_memory(error):
             return _refuse("out of device memory; try a smaller --size or capacity.", EXIT_MEMORY)
         given = next((f"{name}={os.environ[name]}" for name in PLATFORMS if os.environ.get(name)), None)
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)

@@ -22,6 +22,11 @@ class CacheError(RuntimeError):
     """The cache cannot hold its tokens. Raised outside jit by `cache.check_cache`; the message says what to do."""
 
 
+def is_out_of_memory(error: Exception) -> bool:
+    """True if a device's memory is exhausted: XLA raises a RuntimeError of its own that starts with this word."""
+    return "RESOURCE_EXHAUSTED" in str(error)
+
+
 MAX_ECHO_LENGTH = 80  # characters of a refused value that a message repeats, so that it stays one line
 
 

@@ -31,6 +31,7 @@ from ssplat_jax.streaming.session import Session, tokens_per_chunk
 
 NUM_CHUNKS = 4  # the last chunks of a stream that an evaluation feeds again to the full cache to time them
 NUM_REPEATS = 3  # measurements per chunk
+OOM = "OOM"  # stands for the peak memory of what did not fit into the memory of the machine
 
 
 def measure_latency(session: Session, chunks: list[Chunk], camera: Camera) -> dict:

@@ -10,7 +10,7 @@ import numpy as np
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.cpu_backend import make_room
-from ssplat_jax.core.errors import InputError, echo, refusal
+from ssplat_jax.core.errors import InputError, echo, is_out_of_memory, refusal
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import PROCEDURAL_SIZE, is_capture, open_capture, without_tilde
@@ -24,6 +24,7 @@ from ssplat_jax.data.split import (
     read_index,
     split_of_scene,
 )
+from ssplat_jax.evaluation.cost import OOM
 from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.evaluation.scoring import ScoredView, evaluate, mean_scores, score_view
@@ -105,7 +106,13 @@ def evaluate_run(model: StreamSplat, params: dict, options: Eval, reporter: Repo
     for scene, capture in captures.items():
         make_room()  # programs of many scenes would be too many for one process
         reporter.say(scene)
-        scored[scene] = evaluated(capture, splits[scene], out / scene, scene)
+        try:
+            scored[scene] = evaluated(capture, splits[scene], out / scene, scene)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+            scored[scene] = {"peak_memory_bytes": OOM}
+            reporter.warn(f"{scene}: out of memory; so there are no means over scenes")
     metrics = scene_metrics(scored) | {"left_out": [scene for scene, split in index.items() if split is None]}
     write_json(RunFolder(out).index, index_to_json(index))
     write_json(RunFolder(out).metrics, metrics)
@@ -148,7 +155,8 @@ def _open_scenes(path: str, index: Index, size: tuple[int, int] | None) -> dict[
         raise refusal(str(folder), wanted=f"a capture, or scenes such as {next(iter(index))}", got=got, fix=fix)
     used = [scene for scene, split in index.items() if split is not None]
     if not used:
-        raise refusal("--index", wanted="a scene that is not null", got="none", fix="choose frames for one")
+        fix = "choose a smaller --context, or frames for one in --index"
+        raise refusal(str(folder), wanted="frames of at least one scene", got="none", fix=fix)
     return {scene: open_capture(with_options(str(folder / scene), **written), size=size) for scene in used}
 
 
@@ -156,14 +164,18 @@ def scene_metrics(scored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Means over scenes.
 
     Args:
-        scored: the metrics of `evaluate` by scene, which are means over the views of the scene.
+        scored: the metrics of `evaluate` by scene, which are means over the views of the scene; of one that did not fit
+            into memory, `peak_memory_bytes` alone, which is `OOM`.
 
     Returns:
-        `scenes`, the scores and the number of targets of each; `over_scenes`, the mean over views, then scenes; and
+        `scenes`, the scores, number of targets and memory of each; `over_scenes`, the mean over views, then scenes; and
         `over_views`, the mean over the views of all scenes; `lpips` is None where a scene has none. And the largest
-        `peak_memory_bytes` of a scene.
+        `peak_memory_bytes` of a scene. With a scene that is `OOM` there are no means.
     """
-    rows = {scene: {name: m[name] for name in (*SCORES, "target_views")} for scene, m in scored.items()}
+    names = (*SCORES, "target_views", "peak_memory_bytes")
+    rows = {scene: {name: m.get(name) for name in names} for scene, m in scored.items()}
+    if OOM in (row["peak_memory_bytes"] for row in rows.values()):
+        return {"scenes": rows, "over_scenes": None, "over_views": None, "peak_memory_bytes": OOM}
     weights = np.array([row["target_views"] for row in rows.values()], np.float64)
     blocks = [{name: row[name] for name in SCORES} for row in rows.values()]
     return {

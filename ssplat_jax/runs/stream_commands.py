@@ -303,7 +303,8 @@ class Eval(StreamOptions):
         with lock_folder(self.out):
             metrics = evaluate_run(model, params, self, Reporter(self.quiet))
         if "scenes" in metrics:
-            scores = _both_scores(metrics["over_scenes"])
+            means = metrics["over_scenes"]
+            scores = "no means, a scene is out of memory" if means is None else _both_scores(means)
             print(f"{len(metrics['scenes'])} scenes: {scores}; {self.out}/metrics.json, {self.out}/*/report.html")
             return 0
         reference = metrics["baselines"]

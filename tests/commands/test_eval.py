@@ -46,6 +46,24 @@ def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow, 
     assert metrics["peak_memory_bytes"] == max(a["peak_memory_bytes"], b["peak_memory_bytes"])
 
 
+def test_a_scene_without_memory_is_a_row_and_the_others_are_scored(tmp_path, monkeypatch, capsys):
+    def evaluate(session, capture, split, out, reporter, **_):
+        if capture.name == "a":
+            raise RuntimeError("RESOURCE_EXHAUSTED: 9 GiB")
+        return {"literal": one, "shown": one, "target_views": 2, "peak_memory_bytes": 7}
+
+    one, out = {"psnr": 9.0, "ssim": 0.5, "lpips": None}, tmp_path / "out"
+    monkeypatch.setattr(evaluate_run, "evaluate", evaluate)
+    monkeypatch.setattr(evaluate_run, "report_eval", lambda *_: None)
+    for name in ("a", "b"):
+        make_capture(tmp_path / "scenes" / name, num_frames=12, size=SIZE)
+    assert run("eval", str(tmp_path / "scenes"), "--context", "8", "--out", str(out)) == 0
+    metrics, (words, _) = read(out / "metrics.json"), capsys.readouterr()
+    assert metrics["scenes"]["a"]["peak_memory_bytes"] == metrics["peak_memory_bytes"] == "OOM"
+    assert metrics["scenes"]["b"]["literal"] == one and metrics["over_scenes"] is metrics["over_views"] is None
+    assert "out of memory" in words
+
+
 def test_a_folder_of_scenes_without_an_index_gets_one_by_the_protocol(tmp_path):
     """The index reads as those that are published; a scene that is too short is null."""
     for name, num_frames in (("a", 12), ("b", 9), ("c", 5)):
