@@ -27,7 +27,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.evaluation.cost import peak_memory
 from ssplat_jax.evaluation.metrics import installed_lpips
-from ssplat_jax.evaluation.scoring import score_targets, score_view
+from ssplat_jax.evaluation.scoring import mean_scores, score_view, score_views
 from ssplat_jax.model.network import complete_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.weights import load_params
@@ -239,7 +239,8 @@ def scored(session: Session, capture: Capture, split: Split) -> Row:
     stream_frame = capture.stream_frame(session.model.config, split.context)
     exposures, _ = feed_capture(session, capture, split.context, stream_frame)
     gaussians, middle = session.gaussians(), split.targets[len(split.targets) // 2]
-    scores = score_targets(gaussians, capture, split.targets, stream_frame, exposures, installed_lpips())
+    views = score_views(gaussians, capture, split.targets, stream_frame, exposures, installed_lpips())
+    scores = mean_scores(views)
     values = {f"{c}_{m}": scores[c][m] for c in COLUMNS for m in ("psnr", "ssim", "lpips")}
     return {
         **values,

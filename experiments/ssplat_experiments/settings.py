@@ -12,7 +12,7 @@ from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.evaluation.metrics import installed_lpips
-from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.evaluation.scoring import mean_scores, score_views
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, key_views_of
 from ssplat_jax.streaming.session import Exposures, feed_capture
@@ -105,7 +105,7 @@ class _Streamed:
     def row(self, setting: Setting, gaussians: Gaussians) -> dict[str, Any]:
         """A row of the table, with the scores of `gaussians`."""
         given = (self.scored, self.split.targets, self.stream_frame, self.exposures, installed_lpips())
-        scores = score_targets(gaussians, *given)
+        scores = mean_scores(score_views(gaussians, *given))
         row = {"setting": setting.name} | {kind: round(scores[kind]["psnr"], 3) for kind in ("shown", "literal")}
         row |= {f"{kind}_{name}": scores[kind][name] for kind in ("shown", "literal") for name in ("ssim", "lpips")}
         return row | self.cost

@@ -270,11 +270,8 @@ def _merge_pair(older: Fields, newer: Fields) -> Fields:
     merged = {name: average(name) for name in ("means", "feats", "rgbs", "changes") if name in older}
     best = ("seeds", "confidences", "quats", "footprints")
     merged |= {name: _select(newer_is_best, newer[name], older[name]) for name in best}
-    merged |= {name: older[name] + newer[name] for name in ("observations",) if name in older}
-    return merged | {
-        "num_members": older["num_members"] + newer["num_members"],
-        "last_chunks": jnp.maximum(older["last_chunks"], newer["last_chunks"]),
-    }
+    merged |= {name: older[name] + newer[name] for name in ("num_members", "observations") if name in older}
+    return merged | {"last_chunks": jnp.maximum(older["last_chunks"], newer["last_chunks"])}
 
 
 def _read(x: Array, places: Integer[Array, "*b"]) -> Array:

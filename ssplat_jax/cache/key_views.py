@@ -11,9 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from ssplat_jax.core.cameras import Camera, usable_cameras
 from ssplat_jax.core.pytree import pytree
 
-NUM_KEY_VIEWS = 64
-"""Views that a stream keeps to compare the scene with; when all places are taken, one of the two most similar is
-replaced."""
+NUM_KEY_VIEWS = 64  # views that a stream keeps to compare the scene with
 
 
 @pytree
@@ -68,13 +66,12 @@ class KeyViews:
             images = jnp.round(jnp.clip(images, 0.0, 1.0) * 255).astype(jnp.uint8)
         if seen is not None:
             images = jnp.concatenate([images, seen[..., None].astype(jnp.uint8)], axis=-1)
+        exposures = np.ones((len(images), 3)) if exposures is None else exposures
         return KeyViews(
             images=jnp.asarray(images),
             viewmats=jnp.asarray(camera.viewmats, jnp.float32),
             Ks=jnp.asarray(camera.Ks, jnp.float32),
-            exposures=jnp.ones((images.shape[0], 3), jnp.float32)
-            if exposures is None
-            else jnp.asarray(exposures, jnp.float32),
+            exposures=jnp.asarray(exposures, jnp.float32),
             valid=jnp.ones(images.shape[0], bool),
         )
 

@@ -115,6 +115,8 @@ PIVOT_FIELDS = ("means", "feats", "seeds", "confidences", "rgbs", "quats", "foot
 OPTIONAL_PIVOT_FIELDS = ("observations", "changes")
 """Further such fields, None where the configuration does not ask for them."""
 
+ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, *OPTIONAL_PIVOT_FIELDS)  # arrays with one row per voxel
+
 
 def pivot_fields(cache: VoxelCache) -> tuple[str, ...]:
     """Names of the pivot fields that `cache` has: `PIVOT_FIELDS`, and those of `OPTIONAL_PIVOT_FIELDS` in use."""
@@ -193,11 +195,8 @@ def with_refinement(
         InputError: it has key views of another size or number.
     """
     slots = (NUM_KEY_VIEWS, height, width, 4 if is_masked else 3)
-    changes, key_views = cache.changes, cache.key_views
-    if changes is None:
-        changes = empty_changes(cache.capacity, config)
-    if key_views is None:
-        key_views = empty_key_views(*slots)
+    changes = empty_changes(cache.capacity, config) if cache.changes is None else cache.changes
+    key_views = empty_key_views(*slots) if cache.key_views is None else cache.key_views
     if is_masked and key_views.seen is None:  # the first mask of the stream: nothing before it was hidden
         images = jnp.pad(key_views.images, [(0, 0)] * 3 + [(0, 1)], constant_values=1)
         key_views = replace(key_views, images=images)

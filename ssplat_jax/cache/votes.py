@@ -293,10 +293,8 @@ def observation_features(observations: Float[Array, "n s"]) -> Float[Array, "n f
         Above a total weight of `MOST_OBSERVED` the counts grow no further; shares and means stay those of all views.
     """
     most = MOST_OBSERVED / jnp.maximum(total_weight(observations), MOST_OBSERVED)
-    observations = observations * most[..., None]
-    on, before, behind, error_on, error_before, offset, crowd, relative, size = jnp.moveaxis(
-        jax.lax.stop_gradient(observations), -1, 0
-    )
+    observations = jax.lax.stop_gradient(observations * most[..., None])
+    on, before, behind, error_on, error_before, offset, crowd, relative, size = jnp.moveaxis(observations, -1, 0)
     total, times_on = jnp.maximum(on + before + behind, 1e-3), jnp.maximum(on, 1e-3)
     error = (error_on + error_before) / jnp.maximum(on + before, 1e-3)
     features = (

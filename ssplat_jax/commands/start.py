@@ -26,13 +26,9 @@ PATIENCE = 5.0
 def start() -> None:
     """Runs the command line of this process and exits with its code."""
     if sys.platform == "win32":  # it can neither lock nor flush a folder as we do
-        print("ssplat: wanted Linux or macOS, got Windows; use the Windows Subsystem for Linux.", file=sys.stderr)
-        sys.exit(2)
+        _leave(2, "ssplat: wanted Linux or macOS, got Windows; use the Windows Subsystem for Linux.\n")
     if sys.flags.optimize > 1:
-        print(
-            "ssplat: wanted Python with docstrings, which scikit-image needs, got -OO; leave it out.", file=sys.stderr
-        )
-        sys.exit(2)
+        _leave(2, "ssplat: wanted Python with docstrings, which scikit-image needs, got -OO; leave it out.\n")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a name that the terminal's encoding lacks ends no command
             stream.reconfigure(errors="backslashreplace")

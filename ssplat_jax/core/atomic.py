@@ -47,9 +47,8 @@ def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = 
             partial.unlink(missing_ok=True)
             if moved:
                 os.replace(previous_path(path), path)
-        raise StorageError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space or choose another place."
-        ) from error
+        reason = error.strerror or error
+        raise StorageError(f"{path}: cannot be written ({reason}); free some space or choose another place.") from error
 
 
 def previous_path(path: str | os.PathLike) -> Path:

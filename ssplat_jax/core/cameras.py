@@ -67,9 +67,7 @@ def check_camera(camera: Camera, where: str, name: str = "camera", *, complete: 
         raise InputError(f"{where}: the {name} must have viewmats [*b 4 4] and Ks [*b 3 3], got {got}.")
     if not all(is_whole(side) and side >= 1 for side in (camera.width, camera.height)):
         got = f"{echo(camera.width)}x{echo(camera.height)}"
-        raise InputError(
-            f"{where}: the image of the {name} must have whole numbers of pixels, at least 1x1, got {got}."
-        )
+        raise InputError(f"{where}: the {name}'s image must have whole numbers of pixels, at least 1x1, got {got}.")
     check_matrices(camera.viewmats, camera.Ks, where, complete=complete)
 
 

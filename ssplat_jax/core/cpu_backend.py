@@ -168,6 +168,5 @@ def _short_exp_jvp(low: float, primals, tangents):
 @functools.cache
 def _growth_coefficients(low: float) -> np.ndarray:
     """Polynomial of degree 5 for e^y on [0, -low / 2^EXP_SQUARINGS], lowest power first."""
-    interval = [0.0, -low / 2**EXP_SQUARINGS]
-    chebyshev = np.polynomial.Chebyshev.interpolate(np.exp, 5, interval)
+    chebyshev = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -low / 2**EXP_SQUARINGS])
     return chebyshev.convert(kind=np.polynomial.Polynomial).coef

@@ -42,9 +42,7 @@ class Gaussians:
         if not jnp.issubdtype(colors.dtype, jnp.floating) or (is_known and np.mean(np.asarray(colors) > 4.0) > 0.5):
             fix = "divide bytes by 255"
             raise refusal("from_rgb: colors", wanted="floats in [0, 1]", got=f"{colors.dtype} of 0 to 255", fix=fix)
-        return Gaussians(
-            means=means, quats=quats, scales=scales, opacities=opacities, sh=((colors - 0.5) / SH_C0)[:, None, :]
-        )
+        return Gaussians(means, quats, scales, opacities, sh=((colors - 0.5) / SH_C0)[:, None, :])
 
     def __repr__(self) -> str:
         """The number of rows and the SH degree; arrays of a scene are too long to print."""

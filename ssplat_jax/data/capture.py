@@ -342,8 +342,7 @@ class Capture:
         arrays |= {"near": np.float32(stream_frame.near), "far": np.float32(stream_frame.far)}
         if self.is_masked:
             arrays["seen"] = np.ones(images.shape[:3], bool)
-            for row, i in enumerate(group):
-                arrays["seen"][row] = self.seen(i)
+            arrays["seen"][: len(group)] = [self.seen(i) for i in group]
         if self.brings_depth:
             arrays["depths"] = np.zeros(images.shape[:3], np.float32)
             for row, i in enumerate(group):

@@ -1,7 +1,4 @@
-"""Summary of a capture for `ssplat inspect`: facts, the scale and depth range of a run, and warnings with remedies.
-
-Warnings about frames tell of disorder and gaps in the motion.
-"""
+"""Summary of a capture for `ssplat inspect`: facts, the scale and depth range of a run, and warnings with remedies."""
 
 from collections.abc import Callable
 from typing import Any
@@ -99,10 +96,8 @@ def _depth_warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray
         stride = min(max(2, round(GOOD_STEP / max(step, 1e-6))), len(capture))
         found.append(f"Low parallax: a step is {step:.2%} of the median depth; try --stride {stride}.")
     elif depths.parallax_degrees < LOW_PARALLAX_DEGREES:
-        found.append(
-            f"Little parallax: {depths.parallax_degrees:.1f} degrees at the median, so depth is uncertain; add frames"
-            " from the sides, or come closer."
-        )
+        told = f"{depths.parallax_degrees:.1f} degrees at the median, so depth is uncertain"
+        found.append(f"Little parallax: {told}; add frames from the sides, or come closer.")
     elif step > HIGH_STEP:
         found.append(f"Wide steps: {step:.0%} of the median depth; neighbors hardly overlap, so add frames between.")
     i, longest = int(steps.argmax()), float(steps.max() / np.median(moved))
@@ -121,8 +116,6 @@ def order_warnings(capture: Capture) -> list[str]:
     ranks = [np.sum(np.linalg.norm(centers - centers[i], axis=-1) < step) for i, step in enumerate(steps)]
     rank = float(np.median(ranks))
     if rank > max(3.0, SHUFFLED_RANK * len(capture)):
-        return [
-            f"Frames are not in the order of a path: the next camera is only the {rank:.0f}th nearest of"
-            f" {len(capture)}, at the median; name the images in the order of filming."
-        ]
+        told = f"the next camera is only the {rank:.0f}th nearest of {len(capture)}, at the median"
+        return [f"Frames are not in the order of a path: {told}; name the images in the order of filming."]
     return []

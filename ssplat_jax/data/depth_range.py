@@ -2,8 +2,7 @@
 
     ORB keypoints -> mutual matches near the epipolar lines -> inverse depths and parallax -> quantiles
 
-The estimate takes some seconds per capture. It uses only the given frames, so the targets of an evaluation have no
-influence on near, far and scale.
+The estimate takes some seconds per capture.
 
 Depths are kept as *signed inverse* depths up to the last step: with little parallax, the error of a point is symmetric
 in inverse depth and may move it past infinity. Dropping such points, or those with little parallax, would bias the
@@ -71,7 +70,6 @@ class DepthStatistics:
     median: float
     q99: float
     num_points: int
-    num_pairs: int
     parallax_degrees: float  # median over the points; 0 if there are none
     source: str  # "matches" (measured), "poor parallax" (only the median is measured) or "baselines" (a guess)
 
@@ -109,15 +107,12 @@ def estimate_depths(
         points = _best_pair(capture, indices[reference], indices, baseline, keypoints)
         if points is not None:
             pairs.append(points)
-            inverse_depth = _median(pairs)
-            baseline = math.radians(GOOD_PARALLAX_DEGREES) / max(inverse_depth, 1e-300)
+            baseline = math.radians(GOOD_PARALLAX_DEGREES) / max(_median(pairs), 1e-300)
     good = [p for p in pairs if np.median(p.parallax) >= POOR_PARALLAX_DEGREES]
     if sum(p.parallax.size for p in good) >= MIN_TOTAL_POINTS and _median(good) > 0:
         return _statistics(good)
-    if sum(p.parallax.size for p in pairs) >= MIN_TOTAL_POINTS:
-        inverse_depth = _median(pairs)
-        if inverse_depth > 0:
-            return _guess(1 / inverse_depth, "poor parallax", pairs)
+    if sum(p.parallax.size for p in pairs) >= MIN_TOTAL_POINTS and (inverse_depth := _median(pairs)) > 0:
+        return _guess(1 / inverse_depth, "poor parallax", pairs)
     steps = np.linalg.norm(np.diff(np.stack([capture.frames[i].center for i in indices]), axis=0), axis=-1)
     steps = steps[steps > same_place_distance(capture, indices)]
     return _guess(BASELINE_DEPTH * float(np.median(steps)) if steps.size else 1.0, "baselines", [])
@@ -165,7 +160,7 @@ def _statistics(pairs: list[CommonPoints]) -> DepthStatistics:
         farthest = MAX_RANGE * NEAR_FACTOR / (FAR_FACTOR * nearest)
         reach = max(reach, min(1 / least, farthest))
     quantiles = float(1 / nearest), float(1 / middle), float(reach)
-    return DepthStatistics(*quantiles, inverse.size, len(pairs), float(np.median(parallax)), "matches")
+    return DepthStatistics(*quantiles, inverse.size, float(np.median(parallax)), "matches")
 
 
 def _guess(median: float, source: str, pairs: list[CommonPoints]) -> DepthStatistics:
@@ -173,7 +168,7 @@ def _guess(median: float, source: str, pairs: list[CommonPoints]) -> DepthStatis
     parallax = np.concatenate([p.parallax for p in pairs]) if pairs else np.zeros(1)
     num_points = sum(p.parallax.size for p in pairs)
     quantiles = median / GUESSED_SPREAD, median, median * GUESSED_SPREAD
-    return DepthStatistics(*quantiles, num_points, len(pairs), float(np.median(parallax)), source)
+    return DepthStatistics(*quantiles, num_points, float(np.median(parallax)), source)
 
 
 def _best_pair(
@@ -216,9 +211,8 @@ def _partners(capture: PosedImages, i: int, others: Sequence[int]) -> tuple[list
     offsets = np.stack([capture.frames[j].center for j in others]) - frame.center
     axes = np.stack([capture.frames[j].camtoworld[:3, 2] for j in others])
     distances = np.linalg.norm(offsets, axis=-1)
-    is_partner = (axes @ frame.camtoworld[:3, 2] > math.cos(math.radians(MAX_AXIS_DEGREES))) & (
-        distances > same_place_distance(capture, [i, *others])
-    )
+    is_aligned = axes @ frame.camtoworld[:3, 2] > math.cos(math.radians(MAX_AXIS_DEGREES))
+    is_partner = is_aligned & (distances > same_place_distance(capture, [i, *others]))
     order = [int(k) for k in np.argsort(distances, kind="stable") if is_partner[k]]
     return [others[k] for k in order], distances[order]
 

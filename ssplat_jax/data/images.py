@@ -24,6 +24,7 @@ DEPTH_MODES = ("I;16", "I;16B", "I")  # Pillow's modes of 16-bit images
 BITS, PHOTOMETRIC = 258, 262  # TIFF tags: bits of a channel; 0 if zero is white
 ORIENTATION, UPRIGHT = 274, 1  # EXIF tag, and its value for images that need no rotation
 MAX_LABEL = 100  # largest value of a mask that numbers objects from 1, and 0 for what is masked out
+Matrix = Float64[np.ndarray, "3 3"]
 REPLACE = f"replace the file (formats read: {', '.join(IMAGE_FORMATS)})"
 
 
@@ -164,7 +165,7 @@ class Crop:
         """True if the delivered image equals the stored one."""
         return (self.scale, self.left, self.top) == (1.0, 0.0, 0.0)
 
-    def intrinsics(self, K: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+    def intrinsics(self, K: Matrix) -> Matrix:
         """Converts intrinsics of the stored image to those of the delivered one."""
         return np.diag([self.scale, self.scale, 1.0]) @ (K - np.array([[0, 0, self.left], [0, 0, self.top], [0, 0, 0]]))
 
@@ -235,7 +236,7 @@ class Lens:
             along = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
             return np.stack([across, along], axis=-1)
 
-    def pixels(self, K: Float64[np.ndarray, "3 3"], points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
+    def pixels(self, K: Matrix, points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
         """Maps pixels of the pinhole image to pixels of the distorted one; both have the intrinsics `K`."""
         center, focal = K[:2, 2], np.diag(K)[:2]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -266,7 +267,7 @@ class FisheyeLens(Lens):
 PINHOLE = Lens()  # no distortion
 
 
-def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str) -> float:
+def check_lens(lens: Lens, K: Matrix, width: int, height: int, where: str) -> float:
     """The largest displacement by distortion on the border of the image, in pixels; exactly 0 without any.
 
     Distortion that folds the image is refused: its coefficients probably belong to another model.
@@ -296,19 +297,14 @@ def _border(width: int, height: int) -> Float64[np.ndarray, "36 2"]:
     return np.concatenate([edge, edge[:, ::-1]]) * (width, height)
 
 
-def shows_too_little(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int) -> bool:
+def shows_too_little(lens: Lens, K: Matrix, width: int, height: int) -> bool:
     """True if the undistorted image has pixels that the stored one does not show, by more than half a pixel."""
     shown = lens.pixels(K, _border(width, height))
     return bool(((shown < -0.5) | (shown > np.array([width, height]) + 0.5)).any())
 
 
 def undistort(
-    image: Float32[np.ndarray, "h w *c"],
-    lens: Lens,
-    K: Float64[np.ndarray, "3 3"],
-    *,
-    order: int = 1,
-    outside: float | None = None,
+    image: Float32[np.ndarray, "h w *c"], lens: Lens, K: Matrix, *, order: int = 1, outside: float | None = None
 ) -> Float32[np.ndarray, "h w *c"]:
     """The image (or depth map) that a pinhole camera of the same intrinsics would have taken.
 

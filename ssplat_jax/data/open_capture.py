@@ -16,11 +16,11 @@ from ssplat_jax.data.capture import MAX_SIDE, ArrayPixels, Capture, FilePixels, 
 from ssplat_jax.data.images import MAX_PIXELS
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, split_options
 from ssplat_jax.data.readers import CAPTURE_READERS
-from ssplat_jax.data.readers.frame_list import Listing, files_in, in_stream_order
+from ssplat_jax.data.readers.frame_list import LISTED, Listing, files_in, in_stream_order
 from ssplat_jax.data.readers.transforms_json import TRANSFORMS_JSON, read_transforms
 
 UNREADABLE_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".jxl"})  # what phones write and we do not read
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"}) | UNREADABLE_SUFFIXES
+IMAGE_SUFFIXES = LISTED | UNREADABLE_SUFFIXES
 """Images in a folder of these lack only their poses."""
 ARCHIVES = frozenset({".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})

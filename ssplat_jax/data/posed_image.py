@@ -1,7 +1,5 @@
 """`Frame`, one posed image of a capture; the checks of poses and intrinsics; and the conventions of poses in files.
 
-Poses and intrinsics are float64, because float32 has a spacing of 0.5 m at earth-centered coordinates.
-
 Readers know which convention their format prescribes. Files that follow another one are read with the options `axes`
 and `poses` at the end of the capture's path, such as `scene?axes=opencv&poses=world-to-camera`.
 """
@@ -17,7 +15,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from ssplat_jax.core.errors import echo, refusal
-from ssplat_jax.data.images import Lens
+from ssplat_jax.data.images import Lens, Matrix
+
+Pose = Float64[np.ndarray, "4 4"]
 
 ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that rounding to three decimals explains; larger ones are refused
 ROTATION_ROUNDING = 1e-5  # deviations above this are reported to the user
@@ -33,8 +33,8 @@ class Frame:
     """One posed image as stored, before it is resized."""
 
     name: str  # in the capture's files
-    camtoworld: Float64[np.ndarray, "4 4"]  # OpenCV axes, capture frame
-    K: Float64[np.ndarray, "3 3"]  # pixels of the stored image; the center of the first pixel is (0.5, 0.5)
+    camtoworld: Pose  # OpenCV axes, capture frame
+    K: Matrix  # pixels of the stored image; the center of the first pixel is (0.5, 0.5)
     width: int
     height: int
     path: Path | None = None  # None: the image is in memory
@@ -53,7 +53,7 @@ class Frame:
         return self.camtoworld[:3, 3]
 
 
-def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4 4"], float]:
+def check_camtoworld(matrix: object, where: str) -> tuple[Pose, float]:
     """Checks an untrusted camera-to-world matrix, 4x4 or 3x4, and replaces its rotation by the nearest one.
 
     Returns:
@@ -102,7 +102,7 @@ def _check_numbers(values: np.ndarray, translation: Float64[np.ndarray, "3"], wh
         raise refusal(where, wanted=f"coordinates up to {MAX_COORDINATE:.0e}", got=f"{farthest:.2g}", fix=fix)
 
 
-def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
+def pose_from_quat(wxyz: object, translation: object, where: str) -> Pose:
     """The rigid transform of an untrusted quaternion, which is normalized, and a translation.
 
     Raises:
@@ -125,7 +125,7 @@ def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.
     return pose
 
 
-def invert_pose(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+def invert_pose(pose: Pose) -> Pose:
     """The inverse of a rigid transform."""
     back = np.eye(4)
     back[:3, :3] = pose[:3, :3].T
@@ -133,9 +133,7 @@ def invert_pose(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
     return back
 
 
-def check_intrinsics(
-    *, fx: float, fy: float, cx: float, cy: float, width: int, height: int, where: str
-) -> Float64[np.ndarray, "3 3"]:
+def check_intrinsics(*, fx: float, fy: float, cx: float, cy: float, width: int, height: int, where: str) -> Matrix:
     """The intrinsics matrix of checked values in pixels; the center of the first pixel is (0.5, 0.5).
 
     Raises:
@@ -169,12 +167,12 @@ class Convention:
     axes: Axes = "opencv"
     poses: Direction = "camera-to-world"
 
-    def to_opencv(self, written: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    def to_opencv(self, written: Pose) -> Pose:
         """The camera-to-world pose with OpenCV axes of a matrix in this convention."""
         camtoworld = written if self.poses == "camera-to-world" else invert_pose(written)
         return camtoworld if self.axes == "opencv" else camtoworld @ OPENGL_TO_OPENCV
 
-    def from_opencv(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    def from_opencv(self, camtoworld: Pose) -> Pose:
         """The matrix in this convention of a camera-to-world pose with OpenCV axes."""
         camtoworld = camtoworld if self.axes == "opencv" else camtoworld @ OPENGL_TO_OPENCV
         return camtoworld if self.poses == "camera-to-world" else invert_pose(camtoworld)

@@ -23,7 +23,7 @@ from PIL import Image
 from skimage import feature, measure, transform  # which load what is used of them, with scipy.stats, at its first use
 
 from ssplat_jax.core.numerics import evenly_spread
-from ssplat_jax.data.posed_image import CONVENTIONS, Convention, Frame
+from ssplat_jax.data.posed_image import CONVENTIONS, Convention, Frame, Matrix, Pose
 
 LONG_SIDE = 320  # pixels of the working image; smaller images are enlarged, as ORB ignores a border of 16 pixels
 MIN_SIDE = 48  # pixels of the working image; narrower images have no room for an ORB patch
@@ -49,7 +49,7 @@ class PosedImages(Protocol):
 
     @property
     def frames(self) -> Sequence[Frame]: ...
-    def K(self, i: int) -> Float64[np.ndarray, "3 3"]: ...
+    def K(self, i: int) -> Matrix: ...
     def image(self, i: int) -> Float32[np.ndarray, "h w 3"]: ...
     def seen(self, i: int) -> Bool[np.ndarray, "h w"] | None: ...
 
@@ -74,6 +74,8 @@ class CommonPoints:
 
 
 KeypointsOf = Callable[[int], Keypoints]  # function that returns the keypoints of a frame
+Vector = Float64[np.ndarray, "3"]
+Rays = Float64[np.ndarray, "n 3"]
 
 
 def detect_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:
@@ -167,23 +169,18 @@ def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsO
     return CommonPoints(inverse_depths=inverse_depths, parallax=parallax, weights=weights, close=np.zeros(0))
 
 
-def motion_between(
-    a: Float64[np.ndarray, "4 4"], b: Float64[np.ndarray, "4 4"]
-) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+def motion_between(a: Pose, b: Pose) -> tuple[Matrix, Vector]:
     """Rotation and translation from camera a to camera b, whose camera-to-world poses are given."""
     return b[:3, :3].T @ a[:3, :3], b[:3, :3].T @ (a[:3, 3] - b[:3, 3])
 
 
-def pixel_rays(K: Float64[np.ndarray, "3 3"], pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+def pixel_rays(K: Matrix, pixels: Float64[np.ndarray, "n 2"]) -> Rays:
     """The points at depth 1 on the rays through pixels."""
     return np.concatenate([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones((len(pixels), 1))], axis=-1)
 
 
 def epipolar_distances(
-    rays_a: Float64[np.ndarray, "n 3"],
-    rays_b: Float64[np.ndarray, "m 3"],
-    R: Float64[np.ndarray, "3 3"],
-    t: Float64[np.ndarray, "3"],
+    rays_a: Rays, rays_b: Float64[np.ndarray, "m 3"], R: Matrix, t: Vector
 ) -> Float64[np.ndarray, "n m"]:
     """The distance of each ray of camera b from the epipolar line of each ray of camera a.
 
@@ -194,9 +191,7 @@ def epipolar_distances(
 
 
 def match(
-    descriptors_a: Bool[np.ndarray, "n bits"],
-    descriptors_b: Bool[np.ndarray, "m bits"],
-    allowed: Bool[np.ndarray, "n m"],
+    descriptors_a: Bool[np.ndarray, "n d"], descriptors_b: Bool[np.ndarray, "m d"], allowed: Bool[np.ndarray, "n m"]
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
     """The rows of `descriptors_a` and `descriptors_b` that are mutual nearest neighbors among `allowed` pairs.
 
@@ -227,10 +222,7 @@ def mutual_nearest(
 
 
 def triangulate(
-    rays_a: Float64[np.ndarray, "n 3"],
-    rays_b: Float64[np.ndarray, "n 3"],
-    R: Float64[np.ndarray, "3 3"],
-    t: Float64[np.ndarray, "3"],
+    rays_a: Rays, rays_b: Rays, R: Matrix, t: Vector
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """The inverse depths in camera a where pairs of rays come closest, and the angles between them in degrees.
 
@@ -331,11 +323,7 @@ def fit_poses(capture: PosedImages, convention: Convention, keypoints: Keypoints
 
 
 def _num_consistent(
-    pair: MatchedPair,
-    a: Float64[np.ndarray, "4 4"],
-    b: Float64[np.ndarray, "4 4"],
-    factors: tuple[float, float] = (1.0, 1.0),
-    tolerance: float = 1.0,
+    pair: MatchedPair, a: Pose, b: Pose, factors: tuple[float, float] = (1.0, 1.0), tolerance: float = 1.0
 ) -> int:
     """Number of matches near their epipolar lines whose points are in front of the first camera.
 
@@ -374,13 +362,10 @@ def pose_warning(fit: PoseFit | None, convention: Convention) -> str | None:
     as_given, better = fit.focal_shares[1.0, 1.0], fit.focal_shares[focal]
     if better >= GOOD_SHARE * fit.coherent_share and better >= BETTER_FOCAL * as_given:
         times = " and ".join(f"{s:g} times {name}" for s, name in zip(focal, ("fx", "fy"), strict=True) if s != 1.0)
-        return (
-            f"Images and focal lengths disagree: {as_given:.0%} of the matches are consistent, and {better:.0%} would"
-            f" be with about {times}; check that the intrinsics are those of these images, as cropped or resized."
-        )
+        shares = f"{as_given:.0%} of the matches are consistent, and {better:.0%} would be with about {times}"
+        fix = "check that the intrinsics are those of these images, as cropped or resized"
+        return f"Images and focal lengths disagree: {shares}; {fix}."
     if given < POOR_SHARE * fit.coherent_share and fit.coherent_share >= GOOD_SHARE:
-        return (
-            f"Poses do not fit the images: {given:.0%} of the matches are consistent with them, and"
-            f" {fit.coherent_share:.0%} with some motion; check that each pose belongs to its image, and intrinsics."
-        )
+        shares = f"{given:.0%} of the matches are consistent with them, and {fit.coherent_share:.0%} with some motion"
+        return f"Poses do not fit the images: {shares}; check that each pose belongs to its image, and intrinsics."
     return None

@@ -105,9 +105,8 @@ class StreamFrame:
             The result is float32: means 1e5 capture units from the offset have an error of up to 1e-2.
         """
         # On the host, where no program has to be compiled for each size of a scene.
-        means, quats, scales, sh = (
-            np.asarray(x, np.float64) for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
-        )
+        fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
+        means, quats, scales, sh = (np.asarray(x, np.float64) for x in fields)
         w, x, y, z = Rotation.from_matrix(self.rotation).as_quat(scalar_first=True, canonical=True)
         product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])  # Hamilton's, from the left
         rows = {

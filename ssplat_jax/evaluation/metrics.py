@@ -29,6 +29,8 @@ from skimage.metrics import structural_similarity
 from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.pytree import pytree
 
+Picture = Num[np.ndarray, "_ _ 3"]
+
 MIN_MSE = 1e-10  # lower bound of the mean squared error: PSNR is at most 100 dB, a finite number that JSON can hold
 
 DARK, BRIGHT, MAX_FAR = -0.5, 4.0, 0.02
@@ -39,9 +41,7 @@ SSIM_ARGUMENTS: dict[str, Any] = {"win_size": 11, "gaussian_weights": True, "dat
 """Arguments of scikit-image's `structural_similarity`; its Gaussian has a standard deviation of 1.5 pixels."""
 
 
-def psnr(
-    image: Num[np.ndarray, "_ _ 3"], target: Num[np.ndarray, "_ _ 3"], seen: Bool[np.ndarray, "_ _"] | None = None
-) -> float:
+def psnr(image: Picture, target: Picture, seen: Bool[np.ndarray, "_ _"] | None = None) -> float:
     """Peak signal-to-noise ratio in dB, over all channels of the pixels `seen`, by default of all pixels.
 
     Limits:
@@ -58,9 +58,7 @@ def psnr(
     return float(-10 * np.log10(np.maximum(np.mean((image - target) ** 2), MIN_MSE)))
 
 
-def ssim(
-    image: Num[np.ndarray, "_ _ 3"], target: Num[np.ndarray, "_ _ 3"], seen: Bool[np.ndarray, "_ _"] | None = None
-) -> float:
+def ssim(image: Picture, target: Picture, seen: Bool[np.ndarray, "_ _"] | None = None) -> float:
     """Mean structural similarity over channels and the pixels `seen`, by default all pixels; 1 for equal images.
 
     Pixels that are not seen are equal in the windows of those that are.

@@ -160,6 +160,5 @@ def _figure(file: Path, caption: str) -> str:
     with Image.open(file) as picture:
         picture.convert("RGB").save(encoded, "JPEG", quality=JPEG_QUALITY)
     data = base64.b64encode(encoded.getvalue()).decode()
-    return (
-        f'<figure><img src="data:image/jpeg;base64,{data}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
-    )
+    shown = f'<img src="data:image/jpeg;base64,{data}" alt="{caption}">'
+    return f"<figure>{shown}<figcaption>{caption}</figcaption></figure>"

@@ -8,7 +8,7 @@ nothing but the rendered image, its alpha and the scene's mean color.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -193,18 +193,27 @@ def mean_images(scores: Sequence[ImageScore]) -> dict[str, float | None]:
     return means
 
 
-def score_targets(
+def score_views(
     gaussians: Gaussians,
     capture: Capture,
-    targets: tuple[int, ...],
+    frames: Sequence[int],
     stream_frame: StreamFrame,
     exposures: Exposures,
     lpips_weights: LpipsWeights | None = None,
-) -> dict[str, Any]:
-    """`mean_scores` of the frames `targets`, scored by `score_view`."""
-    return mean_scores(
-        [score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights).score for i in targets]
-    )
+    picture: Callable[[int], Path] | None = None,
+) -> list[ViewScore]:
+    """Scores of frames by `score_view`, with a picture of each at the path that `picture` names.
+
+    Raises:
+        StorageError: a picture cannot be written.
+    """
+    scores = []
+    for i in frames:
+        view = score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights)
+        if picture is not None:
+            view.save(picture(i), stream_frame.depth_range)
+        scores.append(view.score)
+    return scores
 
 
 def baselines(capture: Capture, split: Split) -> dict[str, float]:
@@ -275,15 +284,10 @@ def evaluate(
     stream_frame = begin_stream(session, streamed, split.context)
     reporter.warn_all(*capture.notes, stream_frame.warning)
     reference = baselines(capture, split)
-    with reporter.progress("streaming", len(split.context)) as advance:
+    context, keep_order = split.context, split.keeps_order
+    with reporter.progress("streaming", len(context)) as advance:
         exposures, recent = feed_capture(
-            session,
-            streamed,
-            split.context,
-            stream_frame,
-            keep_order=split.keeps_order,
-            num_recent=NUM_CHUNKS,
-            on_chunk=advance,
+            session, streamed, context, stream_frame, keep_order=keep_order, num_recent=NUM_CHUNKS, on_chunk=advance
         )
     cost = {  # before the latency is measured, for which the cache may grow and a step be compiled
         "compile_s": round(session.compile_seconds, 2),
@@ -295,7 +299,7 @@ def evaluate(
     }
     gaussians, refinement = session.gaussians(), {}
     if refine_steps:
-        before = score_targets(gaussians, capture, split.targets, stream_frame, exposures, lpips_weights)
+        before = mean_scores(score_views(gaussians, capture, split.targets, stream_frame, exposures, lpips_weights))
         with reporter.progress("refining", refine_steps) as advance:
             key_views = key_views_of(streamed, split.context, stream_frame, exposures)
             progress = Progress.start(gaussians, key_views, FOR_CAPTURES)
@@ -307,11 +311,7 @@ def evaluate(
         refinement = {"refinement": done | {"before": before}}
     middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
     cost["peak_memory_bytes"] = peak_memory(session, middle)["peak_memory_bytes"]
-    scores = []
-    for i in split.targets:
-        view = score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights)
-        view.save(folder.target(i), stream_frame.depth_range)
-        scores.append(view.score)
+    scores = score_views(gaussians, capture, split.targets, stream_frame, exposures, lpips_weights, folder.target)
     timing = measure_latency(session, recent, middle)
     metrics = {
         "capture": capture.name,

@@ -75,11 +75,8 @@ class Encoder(nn.Module):
             x = block(x)
         cnn = self.project(x)
         attended = self.attend_views(cnn, sources, source_valid)
-        return CompactFeatures(
-            fine=self.match_fine(fine),
-            grid=self.match_grid(attended),
-            context=jnp.concatenate([cnn, attended], axis=-1),
-        )
+        context = jnp.concatenate([cnn, attended], axis=-1)
+        return CompactFeatures(fine=self.match_fine(fine), grid=self.match_grid(attended), context=context)
 
     def attend_views(self, cnn, sources, source_valid):
         """CNN features after alternating attention within each view and to the same window of its source views."""
@@ -261,13 +258,12 @@ def stages(config: StreamConfig) -> dict:
     v, side, c = 2, config.network.attention_window, config.network.token_width
     images = jnp.zeros((v, 4 * side, 4 * side, 3))
     sources = jnp.zeros((v, 1), jnp.int32)
-    sources_valid = jnp.ones((v, 1), bool)
     grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
     inside, valid = jnp.ones((v, side, side), bool), jnp.ones(v, bool)
     levels = 2 if config.network.fine_matching else 1
     context = grid(2 * config.network.encoder_widths[1])
     return {
-        "encoder": (Encoder(config), (images, sources, sources_valid)),
+        "encoder": (Encoder(config), (images, sources, valid[:, None])),
         "cost_volume": (CostVolume(config), (grid(levels * config.network.num_depths), context, valid)),
         "tokens": (TokenRegressor(config), (grid(48), grid(1), grid(1), context, grid(config.network.unet_width))),
         "mixer": (Mixer(config), (grid(c), grid(3), inside, valid)),

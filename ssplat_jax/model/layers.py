@@ -31,7 +31,7 @@ def conv2d(x: Float[Array, "v h w c"], kernel: Float[Array, "kh kw c o"], pads: 
 
 def _conv2d_backward(pads, residuals, cotangent):
     x, kernel = residuals
-    kh, kw = kernel.shape[:2]
+    kh, kw, c = kernel.shape[:3]
     flipped = jnp.flip(kernel, axis=(0, 1)).swapaxes(2, 3)
     (top, bottom), (left, right) = pads
     back_pads = ((kh - 1 - top, kh - 1 - bottom), (kw - 1 - left, kw - 1 - right))
@@ -39,9 +39,7 @@ def _conv2d_backward(pads, residuals, cotangent):
     padded = jnp.pad(x, ((0, 0), *pads, (0, 0)))
     height, width = cotangent.shape[1:3]
     flat = cotangent.reshape(-1, cotangent.shape[-1])
-    taps = [
-        padded[:, i : i + height, j : j + width].reshape(-1, x.shape[-1]).T @ flat for i in range(kh) for j in range(kw)
-    ]
+    taps = [padded[:, i : i + height, j : j + width].reshape(-1, c).T @ flat for i in range(kh) for j in range(kw)]
     return x_gradient, jnp.stack(taps).reshape(kernel.shape)
 
 
@@ -286,6 +284,19 @@ class Mlp(nn.Module):
         return nn.Dense(c, name="fc2")(nn.gelu(nn.Dense(4 * c, name="fc1")(x), approximate=False))
 
 
+class SelfAttention(nn.Module):
+    """Self-attention among the tokens of each view."""
+
+    heads: int
+    use_bias: bool = True  # of queries, keys and values
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v n c"], allowed: Bool[Array, "1 1 n"] | None = None) -> Float[Array, "v n c"]:
+        v, n, c = x.shape
+        qkv = nn.Dense(3 * c, use_bias=self.use_bias, name="qkv")(x).reshape(v, n, 3, self.heads, c // self.heads)
+        return nn.Dense(c, name="proj")(attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2], allowed).reshape(v, n, c))
+
+
 class ResidualBlock(nn.Module):
     """Twice conv - InstanceNorm - ReLU, with a projected skip connection where the shape changes."""
 
@@ -311,15 +322,15 @@ class UNetBlock(nn.Module):
     """Residual block: twice GroupNorm - SiLU - conv. The last convolution starts at zero."""
 
     features: int
+    names: tuple[str, ...] = ("norm1", "conv1", "norm2", "conv2", "skip")  # of the parameters
+    norm: Callable[..., nn.Module] = functools.partial(nn.GroupNorm, 8)
 
     @nn.compact
     def __call__(self, x):
-        y = Conv(self.features, name="conv1")(nn.silu(nn.GroupNorm(8, name="norm1")(x)))
-        y = nn.silu(nn.GroupNorm(8, name="norm2")(y))
-        y = Conv(self.features, kernel_init=nn.initializers.zeros, name="conv2")(y)
-        if x.shape[-1] != self.features:
-            x = Conv(self.features, 1, name="skip")(x)
-        return x + y
+        norm1, conv1, norm2, conv2, skip = self.names
+        y = Conv(self.features, name=conv1)(nn.silu(self.norm(name=norm1)(x)))
+        y = Conv(self.features, kernel_init=nn.initializers.zeros, name=conv2)(nn.silu(self.norm(name=norm2)(y)))
+        return (x if x.shape[-1] == self.features else Conv(self.features, 1, name=skip)(x)) + y
 
 
 class JointAttention(nn.Module):

@@ -1,5 +1,8 @@
 """3D token mixer: attention of each token to its neighbors in space, then among all views at 1/16 (as in ReSplat)."""
 
+import functools
+from collections.abc import Callable
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -7,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cpu_backend import lane_sum
-from ssplat_jax.model.layers import Conv, Mlp, attend, layer_norm, pixel_shuffle, pixel_unshuffle
+from ssplat_jax.model.layers import Conv, Mlp, SelfAttention, layer_norm, pixel_shuffle, pixel_unshuffle
 
 SEARCH_BLOCK = 1024  # queries per block of the search for neighbors, which bounds the size of its distance matrix
 GLOBAL_FACTOR = 4  # cells per side that the global block joins to one
@@ -26,33 +29,14 @@ class NeighborAttention(nn.Module):
         return nn.Dense(x.shape[-1], name="proj")(attend_per_query(q, k[neighbors], v[neighbors], usable[neighbors]))
 
 
-class NeighborBlock(nn.Module):
-    """Pre-norm transformer block in which each token attends to its 3D neighbors."""
+class MixerBlock(nn.Module):
+    """Pre-norm transformer block; `attention` takes the tokens and what else the block is given."""
 
-    width: int
-
-    @nn.compact
-    def __call__(self, x, neighbors, usable):
-        x = x + NeighborAttention(self.width, name="attn")(layer_norm("norm1")(x), neighbors, usable)
-        return x + Mlp(name="mlp")(layer_norm("norm2")(x))
-
-
-class TokenAttention(nn.Module):
-    """Self-attention of all tokens."""
+    attention: Callable[..., nn.Module]
 
     @nn.compact
-    def __call__(self, x, allowed):
-        n, c = x.shape
-        qkv = nn.Dense(3 * c, use_bias=False, name="qkv")(x).reshape(1, n, 3, HEADS, c // HEADS)
-        return nn.Dense(c, name="proj")(attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2], allowed).reshape(n, c))
-
-
-class JointBlock(nn.Module):
-    """Pre-norm transformer block over all tokens."""
-
-    @nn.compact
-    def __call__(self, x, allowed):
-        x = x + TokenAttention(name="attn")(layer_norm("norm1")(x), allowed)
+    def __call__(self, x, *given):
+        x = x + self.attention(name="attn")(layer_norm("norm1")(x), *given)
         return x + Mlp(name="mlp")(layer_norm("norm2")(x))
 
 
@@ -63,9 +47,9 @@ class GlobalBlock(nn.Module):
     def __call__(self, x: Float[Array, "v h w c"], view_valid: Bool[Array, " v"]) -> Float[Array, "v h w c"]:
         v, c = x.shape[0], x.shape[-1]
         y = layer_norm("norm1")(nn.Dense(c, name="proj1")(pixel_unshuffle(x, GLOBAL_FACTOR)))
-        tokens = y.reshape(-1, c)
-        allowed = jnp.repeat(view_valid, tokens.shape[0] // v)[None, None]
-        tokens = JointBlock(name="attn")(tokens, allowed)
+        tokens = y.reshape(1, -1, c)
+        allowed = jnp.repeat(view_valid, tokens.shape[1] // v)[None, None]
+        tokens = MixerBlock(functools.partial(SelfAttention, HEADS, use_bias=False), name="attn")(tokens, allowed)
         y = layer_norm("norm2")(nn.Dense(c * GLOBAL_FACTOR**2, name="proj2")(tokens.reshape(y.shape)))
         return x + Conv(c, name="conv")(pixel_shuffle(y, GLOBAL_FACTOR))
 
@@ -97,7 +81,7 @@ class Mixer(nn.Module):
         neighbors = nearest_tokens(constants, inside, network.mixer_neighbors, network.mixer_radius)
         x, usable = feats, inside.reshape(-1)
         for i in range(network.mixer_blocks):
-            block = NeighborBlock(network.mixer_proj, name=f"blocks_{i}")
+            block = MixerBlock(functools.partial(NeighborAttention, network.mixer_proj), name=f"blocks_{i}")
             x = block(x.reshape(-1, x.shape[-1]), neighbors, usable).reshape(x.shape)
             x = GlobalBlock(name=f"mv_blocks_{i}")(x, view_valid)
         return x
@@ -119,8 +103,7 @@ def nearest_tokens(
     v, hf, wf, _ = positions.shape
     side = 2 * radius + 1
     flat = jnp.arange(v * hf * wf).reshape(v, hf, wf)
-    rows = jnp.arange(hf)[:, None] + jnp.arange(side) - radius
-    columns = jnp.arange(wf)[:, None] + jnp.arange(side) - radius
+    rows, columns = (jnp.arange(n)[:, None] + jnp.arange(side) - radius for n in (hf, wf))
     in_rows, in_columns = (rows >= 0) & (rows < hf), (columns >= 0) & (columns < wf)
     in_grid = in_rows[:, None, :, None] & in_columns[None, :, None, :]
     in_grid = jnp.broadcast_to(in_grid, (v, *in_grid.shape)).reshape(v * hf * wf, side * side)

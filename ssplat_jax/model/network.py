@@ -200,10 +200,9 @@ def _modules(config: StreamConfig, network: Network) -> dict:
     """Linen module and example inputs of every stage."""
     v, side, c = 2, config.network.size_multiple // GRID_STRIDE, config.network.token_width
     grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
+    is_learned = config.additions.anchor == "learned"
     shared: dict = {
-        "hpda": (AnchorMaps(), (grid(num_inputs(config)),))
-        if config.additions.anchor == "learned"
-        else (AnchorStrength(), ()),
+        "hpda": (AnchorMaps(), (grid(num_inputs(config)),)) if is_learned else (AnchorStrength(), ()),
         "cgfi": (Aggregator(config), (grid(c), grid(c + config.additions.residual_cgfi), jnp.ones(v, bool))),
     }
     if config.head.evidence:

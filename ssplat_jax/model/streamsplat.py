@@ -90,7 +90,6 @@ class StreamSplat:
         config, network = self.config, network_of(self.config)
         check_chunk(chunk, config.stream.chunk_size)
         views = prepare_views(chunk, config)
-        factor = config.network.match_stride // GRID_STRIDE
         with jax.named_scope("project"):
             history = project(cache, views.grid_camera, config, axis=self.axis)
         with jax.named_scope("encode"):
@@ -98,7 +97,7 @@ class StreamSplat:
         with jax.named_scope("match"):
             distribution = network.match(params["cost_volume"], features, views, config)
         with jax.named_scope("HPDA"):
-            coarse = coarsen(history, factor)
+            coarse = coarsen(history, config.network.match_stride // GRID_STRIDE)
             depth = anchor_depth(params["hpda"], distribution, coarse, views, config)
         with jax.named_scope("refine"):
             depth = network.refine_depth(params.get("upsampler"), features, depth, views, config)

@@ -106,9 +106,7 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
         seen = jnp.pad(chunk.seen, ((0, 0), (0, pad_h), (0, pad_w)), constant_values=True)
         v, hf, wf = inside.shape
         inside &= seen.reshape(v, hf, GRID_STRIDE, wf, GRID_STRIDE).all(axis=(2, 4))
-    depths = chunk.depths
-    if depths is not None:
-        depths = jnp.pad(depths, ((0, 0), (0, pad_h), (0, pad_w)))
+    depths = None if chunk.depths is None else jnp.pad(chunk.depths, ((0, 0), (0, pad_h), (0, pad_w)))
     return Views(
         images=images,
         viewmats=viewmats,

@@ -1,7 +1,4 @@
-"""`adjust_poses`: poses of a capture that fit its images, near the given ones and in their frame.
-
-frames, given poses -> tracks (keypoints seen by several cameras) -> bundle adjustment -> the capture, moved
-"""
+"""`adjust_poses`: poses of a capture that fit its images, near the given ones and in their frame."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -70,11 +67,10 @@ def adjust_poses(
         With fewer than `MIN_TRACKS` points the poses stay. Cameras without a point keep their pose.
     """
     used = list(range(len(capture)) if indices is None else indices)
-    stays = AdjustedPoses(capture, 0.0, 0.0, 0.0, 0.0, 0)
     depth = estimate_depths(capture, used).median
     seen = find_tracks(capture, used, depth, advance)
     if seen.num_points < MIN_TRACKS:
-        return stays
+        return AdjustedPoses(capture, 0.0, 0.0, 0.0, 0.0, 0)
     focal = float(np.median(seen.Ks[:, 0, 0]))
     scales = [focal * np.radians(scale) for scale in SCALES_DEGREES]
     found = adjust(seen, scales, (ROTATION_DEVIATION, TRANSLATION_DEVIATION))

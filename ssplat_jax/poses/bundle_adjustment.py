@@ -190,9 +190,8 @@ def _normal_equations(seen: Observations, unknowns, scale: float, prior):
     by_place[:, [0, 1], [0, 1]] = seen.focals / depths
     by_place[:, :, 2] = -seen.focals * places[:, :2] / depths**2
     by_turn = np.cross(by_place, -(places - twists[seen.views, 3:])[:, None])  # a turn w moves the place by w x place
-    by_camera = np.concatenate([by_turn, by_place], axis=2)
     by_point = by_place @ moved(seen.viewmats, twists)[seen.views, :3, :3]
-    values = np.concatenate([by_camera, by_point], axis=2)
+    values = np.concatenate([by_turn, by_place, by_point], axis=2)
     columns = [6 * seen.views[:, None] + np.arange(6), twists.size + 3 * seen.points[:, None] + np.arange(3)]
     columns = np.repeat(np.concatenate(columns, axis=1), 2, axis=0)
     parts = values.ravel(), columns.ravel(), np.arange(0, values.size + 1, 9)

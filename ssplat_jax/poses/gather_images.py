@@ -19,11 +19,10 @@ from scipy.ndimage import laplace
 
 from ssplat_jax.core.errors import echo, optional_package, reading, refusal
 from ssplat_jax.data.images import DEPTH_MODES, IMAGE_FORMATS, ORIENTATION, UPRIGHT
-from ssplat_jax.data.open_capture import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
-from ssplat_jax.data.readers.frame_list import files_in, natural
+from ssplat_jax.data.open_capture import UNREADABLE_SUFFIXES
+from ssplat_jax.data.readers.frame_list import LISTED, files_in, natural
 
 Advance = Callable[[int], None]
-SUFFIXES = IMAGE_SUFFIXES - UNREADABLE_SUFFIXES
 JPEG_QUALITY = 95
 KEPT_FORMATS = ("JPEG", "PNG")  # pycolmap reads no WebP, for one; other formats are converted
 FOCAL_TAGS = (Base.FocalLength, Base.FocalLengthIn35mmFilm, Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
@@ -46,7 +45,7 @@ def list_photos(folder: Path) -> list[Path]:
     """
     for place in (folder, folder / "images"):
         files = sorted(files_in(place), key=lambda file: natural(file.name))
-        photos = [file for file in files if file.suffix.lower() in SUFFIXES]
+        photos = [file for file in files if file.suffix.lower() in LISTED]
         readable = {file.stem for file in photos}
         phone = [f for f in files if f.suffix.lower() in UNREADABLE_SUFFIXES and f.stem not in readable]
         if phone:
@@ -55,7 +54,7 @@ def list_photos(folder: Path) -> list[Path]:
             raise refusal(str(place), wanted="JPEG or PNG photos", got=got, fix=fix)
         if len(photos) > 1:
             return photos
-    fix = f"give the folder that holds them ({', '.join(sorted(SUFFIXES))}), or a video file"
+    fix = f"give the folder that holds them ({', '.join(sorted(LISTED))}), or a video file"
     raise refusal(str(folder), wanted="a folder of photos", got="fewer than two images", fix=fix)
 
 

@@ -117,8 +117,7 @@ def _depth_order(depths: Float[Array, "b n"], shown: Bool[Array, "b n"]) -> Int[
         keys = jnp.where(shown, depths, jnp.nan)  # NaN sorts behind infinite depths
         return lax.sort((keys, lax.iota(jnp.int32, keys.shape[0])), num_keys=2)[1]
     bits = lax.bitcast_convert_type(depths, jnp.uint32)  # same order as the depths; infinity is below the last key
-    bits = jnp.where(shown, bits, jnp.uint32(0xFFFFFFFF))
-    return packed_argsort(bits)
+    return packed_argsort(jnp.where(shown, bits, jnp.uint32(0xFFFFFFFF)))
 
 
 CAPACITY_SHARES = (17, 20, 24, 28, 32)

@@ -163,9 +163,7 @@ def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid, schedule: Schedul
     """Tiles in order of load, so that those of a batch end together; padded with `grid.num_tiles`, an invalid index."""
     order = jnp.argsort(bounds[1:] - bounds[:-1]).astype(jnp.int32)
     size = min(schedule.batch_size, grid.num_tiles)
-    padding = -grid.num_tiles % size
-    order = jnp.concatenate([jnp.full((padding,), grid.num_tiles, jnp.int32), order])
-    return order.reshape(-1, size)
+    return jnp.pad(order, (-grid.num_tiles % size, 0), constant_values=grid.num_tiles).reshape(-1, size)
 
 
 def _run_steps(
@@ -225,18 +223,11 @@ def _step_columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, la
     return jnp.stack([x, y, p, q, r, jnp.where(is_own, log_opacity, -jnp.inf), *channels, *ones])
 
 
-def _offsets(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[Array, "p u t"]]:
-    """dx and dy of every sample: its pixel's center minus the Gaussian's mean."""
-    side = jnp.arange(grid.tile, dtype=values.dtype) - (grid.tile - 1) / 2  # from the tile's center
-    return (
-        jnp.tile(side, grid.tile)[:, None, None] - values[binning.MEAN_X],
-        jnp.repeat(side, grid.tile)[:, None, None] - values[binning.MEAN_Y],
-    )
-
-
 def _alphas(grid: Grid, values) -> Float[Array, "p u t"]:
     """Alphas of all samples; 0 where they are skipped."""
-    dx, dy = _offsets(grid, values)
+    side = jnp.arange(grid.tile, dtype=values.dtype) - (grid.tile - 1) / 2  # of pixels, from the tile's center
+    dx = jnp.tile(side, grid.tile)[:, None, None] - values[binning.MEAN_X]
+    dy = jnp.repeat(side, grid.tile)[:, None, None] - values[binning.MEAN_Y]
     p, q, r = values[binning.FACTORS]
     across, along = p * dx + q * dy, r * dy
     log_alpha = values[binning.LOG_OPACITY] - across * across - along * along
@@ -292,7 +283,7 @@ def _monomials(grid: Grid, dtype) -> Float[Array, "6 p"]:
     return jnp.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]), dtype)
 
 
-def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> list[Float[Array, "u t"]]:
+def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> tuple[Float[Array, "u t"], ...]:
     """Gradients by the shape columns, from moments of the exponent gradients over the pixels.
 
     The exponent is s^2 + (r dy)^2 with s = p dx + q dy. The moments are taken about the tile's center, by one matrix
@@ -309,11 +300,4 @@ def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> li
     sum_sdy = center * by_y + p * by_xy + q * by_yy - y * sum_s
     sum_dy = by_y - y * one
     sum_dydy = by_yy - y * by_y - y * sum_dy
-    return [
-        -2.0 * p * sum_s,
-        -2.0 * (q * sum_s + r * r * sum_dy),
-        2.0 * sum_sdx,
-        2.0 * sum_sdy,
-        2.0 * r * sum_dydy,
-        -one,
-    ]
+    return -2.0 * p * sum_s, -2.0 * (q * sum_s + r * r * sum_dy), 2.0 * sum_sdx, 2.0 * sum_sdy, 2.0 * r * sum_dydy, -one

@@ -83,9 +83,7 @@ class Effects:
         for field, name in NEEDED_ARRAYS.items():
             flag, is_given = getattr(self, field), arrays[name] is not None
             if flag and not is_given:
-                raise InputError(
-                    f"render: effects.{field} is on and wants {name}, got none; pass it or unset the flag."
-                )
+                raise InputError(f"render: effects.{field} is on and wants {name}, got none; pass it or unset it.")
             flags[field] = is_given and flag is not False
         return self.replace(**flags)
 
@@ -97,10 +95,8 @@ class Effects:
 
 def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:
     """Camera coordinates x, y and z of world points."""
-    entries = columns(means)
-    return tuple(
-        sum(viewmats[:, i, j, None] * entries[j] for j in range(3)) + viewmats[:, i, 3, None] for i in range(3)
-    )
+    point = columns(means)
+    return tuple(sum(viewmats[:, i, j, None] * point[j] for j in range(3)) + viewmats[:, i, 3, None] for i in range(3))
 
 
 def near_planes(gaussians: Gaussians, viewmats: Float[Array, "b 4 4"]) -> Float[Array, " b"]:
@@ -131,10 +127,8 @@ def sampling_rates(gaussians: Gaussians, captured: Camera) -> Float[Array, " n"]
         in_front = z > near
         z = jnp.where(in_front, z, 1.0)
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        margin = constants.CAPTURE_MARGIN
-        inside = (jnp.abs(u / captured.width - 0.5) <= 0.5 + margin) & (
-            jnp.abs(v / captured.height - 0.5) <= 0.5 + margin
-        )
+        reach = 0.5 + constants.CAPTURE_MARGIN
+        inside = (jnp.abs(u / captured.width - 0.5) <= reach) & (jnp.abs(v / captured.height - 0.5) <= reach)
         return jnp.maximum(rates, jnp.where(in_front & inside, jnp.abs(K[0, 0]) / z, 0.0)), None
 
     viewmats = captured.viewmats.reshape(-1, 4, 4).astype(means.dtype)

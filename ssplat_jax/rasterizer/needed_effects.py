@@ -61,8 +61,7 @@ def effects_for(
         exposure=None if exposures is None else _difference(np.asarray(exposures, np.float64)) > VISIBLE,
         outputs=outputs,
     )
-    is_filtered = None if captured is None else _shows_filter(gaussians, camera, captured, effects)
-    return effects.replace(filter_3d=is_filtered)
+    return effects.replace(filter_3d=None if captured is None else _shows_filter(gaussians, camera, captured, effects))
 
 
 def _visible_degree(gaussians: Gaussians) -> int:
@@ -106,9 +105,8 @@ def _difference(exposures: np.ndarray) -> float:
 
 def _shows_filter(gaussians: Gaussians, camera: Camera, captured: Camera, effects: Effects) -> bool:
     """True if a camera samples present Gaussians (f / z, 99 % quantile) finely enough, and the 3D filter is seen."""
-    ours, theirs = (
-        np.asarray(sampling_rates(gaussians, relative_to(one, gaussians.offset))) for one in (camera, captured)
-    )
+    views = [relative_to(one, gaussians.offset) for one in (camera, captured)]
+    ours, theirs = (np.asarray(sampling_rates(gaussians, view)) for view in views)
     seen = (np.asarray(gaussians.opacities) > 0) & (ours > 0) & (theirs > 0)
     if not seen.any() or np.quantile(ours[seen] / theirs[seen], 0.99) <= FINER_SAMPLING:
         return False

@@ -81,14 +81,12 @@ def _project_bwd(effects: Effects, residuals, grads: Splats) -> tuple[Gaussians,
     axes, scales = matrix_entries(gaussians.quats), columns(gaussians.scales)
     scales = [jnp.where(visible, scale, 0.0) for scale in scales]  # infinity times zero is kept out
     always = jnp.any(visible)  # where it is false, all gradients below are 0
-    unscaled = [[sum(row[j] * axes[j][k] for j in range(3)) for k in range(3)] for row in sight.rows]
-    unscaled = kept(unscaled, always)
+    unscaled = kept([[sum(row[j] * axes[j][k] for j in range(3)) for k in range(3)] for row in sight.rows], always)
     roots = [[root * scale for root, scale in zip(part, scales, strict=True)] for part in unscaled]
     shape_grads = kept(_shape_grads(gaussians, splats, grads, roots, effects), always)
     root_grads = kept(_root_grads(roots, shape_grads), always)
     scaled = [[grad * scale for grad, scale in zip(part, scales, strict=True)] for part in root_grads]
-    row_grads = [[sum(axes[j][k] * part[k] for k in range(3)) for j in range(3)] for part in scaled]
-    row_grads = kept(row_grads, always)
+    row_grads = kept([[sum(axes[j][k] * part[k] for k in range(3)) for j in range(3)] for part in scaled], always)
     scale_grads = [sum(root_grads[i][k] * unscaled[i][k] for i in (0, 1)) for k in range(3)]
     point_grads, clipped_grads = _point_grads(sight, camera, row_grads, grads)
     turns = [_cross(grad, row) for grad, row in zip(row_grads, sight.rows, strict=True)]

@@ -119,11 +119,8 @@ def project(
     roots = _screen_roots(gaussians, camera, (tan_x, tan_y, z), distortion, corner)
     factors, variances, compensation = _filtered(*roots, effects)
     opacities = gaussians.opacities * compensation
-    visible = (
-        in_front
-        & (opacities >= constants.ALPHA_MIN)
-        & jnp.all(jnp.abs(means2d) <= 10 * constants.MAX_SCREEN_SIGMA, axis=-1)
-    )
+    on_screen = jnp.all(jnp.abs(means2d) <= 10 * constants.MAX_SCREEN_SIGMA, axis=-1)
+    visible = in_front & (opacities >= constants.ALPHA_MIN) & on_screen
     opacities = jnp.where(visible, opacities, 0.0)
     # alpha >= 1/255 exactly where the Mahalanobis distance is at most `reach`; the margin covers rounding.
     reach = jnp.sqrt(2.0 * jnp.log(jnp.maximum(jax.lax.stop_gradient(opacities) / constants.ALPHA_MIN, 1.0)))

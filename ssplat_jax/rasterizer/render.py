@@ -104,8 +104,7 @@ def render(
     if effects.sh_degree is not None and effects.sh_degree >= gaussians.sh_degree:
         effects = effects.replace(sh_degree=None)  # the same program
     off = {name: None for field, name in NEEDED_ARRAYS.items() if not getattr(effects, field)}
-    inputs = replace(inputs, **off)
-    inputs = _at_least_one_row(inputs)
+    inputs = _at_least_one_row(replace(inputs, **off))
     if max_pairs is not None and not (is_whole(max_pairs) and max_pairs >= 1):
         raise InputError(f"render: max_pairs must be a whole number of at least 1, got {echo(max_pairs)}.")
     if not (is_whole(tile) and tile in TILES):
@@ -244,12 +243,9 @@ def prepare(inputs: RenderInputs, effects: Effects):
     gaussians, num_non_finite = cull_non_finite(gaussians, inputs.features)
     if inputs.captured is not None:
         gaussians = filter_3d(gaussians, inputs.captured)
-    camera = inputs.camera
-    camera = replace(
-        camera, viewmats=camera.viewmats.reshape(-1, 4, 4).astype(dtype), Ks=camera.Ks.reshape(-1, 3, 3).astype(dtype)
-    )
+    viewmats, Ks = inputs.camera.viewmats.reshape(-1, 4, 4), inputs.camera.Ks.reshape(-1, 3, 3)
+    camera, usable = cull_cameras(replace(inputs.camera, viewmats=viewmats.astype(dtype), Ks=Ks.astype(dtype)))
     distortion = None if inputs.distortion is None else inputs.distortion.reshape(-1, 5).astype(dtype)
-    camera, usable = cull_cameras(camera)
     near = None if inputs.near is None else jnp.broadcast_to(inputs.near.astype(dtype), camera.viewmats.shape[:1])
     if distortion is not None:
         splats = project(gaussians, camera, effects, distortion, near)

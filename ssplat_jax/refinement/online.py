@@ -6,8 +6,6 @@
 
 It sits above the stream: `model.step` has no part in it. A step changes no more pivots than its view shows, which
 bounds the time and the memory of a chunk, however long the stream is.
-
-All arrays have fixed sizes, so that neither time nor memory of a round grows without bound.
 """
 
 import functools
@@ -57,14 +55,11 @@ def refine_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chu
     Only `means`, `changes`, `last_chunks` and `key_views` differ. A changed pivot counts as written (`last_chunks`), so
     that deltas report it.
     """
-    config = model.config
     assert cache.key_views is not None  # a `Session` has added them before the step
-    arrivals = KeyViews.of(chunk.camera, chunk.images, output.exposures, chunk.seen)
-    arrivals = replace(arrivals, valid=chunk.valid)
-    kept = keep_views(cache.key_views, arrivals, depth=MEDIAN_DEPTH)
-    views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.stream.steps_per_chunk)
+    arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures, chunk.seen), valid=chunk.valid)
+    views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, model.config.stream.steps_per_chunk)
     views = replace(views, valid=views.valid & jnp.any(chunk.valid))  # a chunk of padding changes nothing
-    cache = replace(cache, key_views=kept)
+    cache = replace(cache, key_views=keep_views(cache.key_views, arrivals, depth=MEDIAN_DEPTH))
     return jax.lax.scan(lambda cache, view: (_refine_view(model, params, cache, view), None), cache, views)[0]
 
 
@@ -82,13 +77,8 @@ def _refine_view(model: StreamSplat, params: dict, cache: VoxelCache, view: KeyV
     is_changed = jnp.any(moved != means, axis=1) | jnp.any(settled != packed, axis=1)
     places = jnp.where(is_changed & (pivots >= 0), pivots, cache.alive.size)
     put = lambda x, new: flat(x).at[places].set(new, mode="drop").reshape(x.shape)  # noqa: E731
-    last_chunk = jnp.broadcast_to(cache.stats.num_chunks - 1, places.shape)
-    return replace(
-        cache,
-        means=put(cache.means, moved),
-        changes=put(cache.changes, settled),
-        last_chunks=put(cache.last_chunks, last_chunk),
-    )
+    written = {"means": moved, "changes": settled, "last_chunks": cache.stats.num_chunks - 1}
+    return replace(cache, **{name: put(getattr(cache, name), new) for name, new in written.items()})
 
 
 def views_of_round(ring: KeyViews, arrivals: KeyViews, num_chunks: Int[Array, ""], num: int) -> KeyViews:

@@ -264,10 +264,9 @@ def key_views_of(capture: Capture, indices: Sequence[int], stream_frame: StreamF
     used = [indices[i] for i in evenly_spread(len(indices), MAX_KEY_VIEWS)]
     cameras = jax.tree.map(lambda *x: np.stack(x), *(capture.camera(i, stream_frame) for i in used))
     # Frame by frame: as floats, all images would take four times the memory of the key views.
-    images = [np.round(np.clip(capture.image(i), 0, 1) * np.float32(255)).astype(np.uint8) for i in used]
+    pixels = np.stack([np.round(np.clip(capture.image(i), 0, 1) * np.float32(255)).astype(np.uint8) for i in used])
     factors = np.stack([exposures[i] for i in used]).astype(np.float32)
     seen = [mask for i in used if (mask := capture.seen(i)) is not None]
-    pixels = np.stack(images)
     if seen:
         pixels = np.concatenate([pixels, np.stack(seen)[..., None].astype(np.uint8)], axis=-1)
     # Not `KeyViews.of`, which compiles a program for each operation.
@@ -276,11 +275,10 @@ def key_views_of(capture: Capture, indices: Sequence[int], stream_frame: StreamF
 
 
 def _check(cameras: Camera, images, exposures) -> None:
-    if cameras.viewmats.ndim != 3 or not len(cameras.viewmats):
-        raise InputError(
-            f"refine: cameras must have one batch axis, viewmats [v 4 4], got {list(cameras.viewmats.shape)}."
-        )
-    wanted = (len(cameras.viewmats), cameras.height, cameras.width, 3)
+    shape = list(cameras.viewmats.shape)
+    if len(shape) != 3 or not shape[0]:
+        raise InputError(f"refine: cameras must have one batch axis, viewmats [v 4 4], got {shape}.")
+    wanted = (shape[0], cameras.height, cameras.width, 3)
     if tuple(jnp.shape(images)) != wanted:
         raise InputError(f"refine: images must be {list(wanted)} like the cameras, got {list(images.shape)}.")
     if images.dtype != jnp.uint8:

@@ -154,10 +154,8 @@ def _moved(state: RefineState, gradient: Change, loss: Float[Array, ""], rate: F
         direction, adam = ADAM.update(gradient, state.adam)  # pyright: ignore[reportArgumentType]
     is_constant = (jnp.arange(state.change.sh.shape[1]) == 0)[:, None]
     factors = units(state.start) | {"sh": jnp.where(is_constant, 1.0, HIGHER_BANDS) / SH_C0}
-    moved = {
-        name: old - rate * RATES[name] * factors[name] * getattr(direction, name)
-        for name, old in vars(state.change).items()
-    }
+    steps = {name: rate * RATES[name] * factor for name, factor in factors.items()}
+    moved = {name: old - steps[name] * getattr(direction, name) for name, old in vars(state.change).items()}
     change = bounded(Change(**moved), state.start)
     keep = lambda new, old: jnp.where(is_finite, new, old)  # noqa: E731
     change, adam = jax.tree.map(keep, (change, adam), (state.change, state.adam))
@@ -173,20 +171,16 @@ def units(gaussians: Gaussians) -> dict[str, Array | float]:
 
 def sizes(gaussians: Gaussians) -> Float[Array, " n"]:
     """Mean of the two larger standard deviations: the extent of a flat Gaussian in its plane."""
-    smallest = jnp.min(gaussians.scales, axis=-1)
-    return (jnp.sum(gaussians.scales, axis=-1) - smallest) / 2
+    return (jnp.sum(gaussians.scales, axis=-1) - jnp.min(gaussians.scales, axis=-1)) / 2
 
 
 def bounded(change: Change, start: Gaussians) -> Change:
     """`change` inside its trust region around `start`."""
     distance = jnp.linalg.norm(change.means, axis=-1, keepdims=True)
     shrink = jnp.minimum(1.0, MAX_SHIFT * sizes(start)[:, None] / jnp.maximum(distance, 1e-30))
-    return replace(
-        change,
-        means=change.means * shrink,
-        log_scales=jnp.clip(change.log_scales, -MAX_LOG_SCALE_CHANGE, MAX_LOG_SCALE_CHANGE),
-        logit_opacities=jnp.clip(change.logit_opacities, -MAX_LOGIT, MAX_LOGIT),
-    )
+    log_scales = jnp.clip(change.log_scales, -MAX_LOG_SCALE_CHANGE, MAX_LOG_SCALE_CHANGE)
+    logits = jnp.clip(change.logit_opacities, -MAX_LOGIT, MAX_LOGIT)
+    return replace(change, means=change.means * shrink, log_scales=log_scales, logit_opacities=logits)
 
 
 def round_rows(num_rows: int) -> int:
@@ -204,10 +198,7 @@ def without_padding(gaussians: Gaussians) -> Gaussians:
 
 def seen_rows(gaussians: Gaussians, key_views: KeyViews, views: Int[Array, " b"]) -> Bool[Array, " n"]:
     """Mask of the Gaussians that may change a pixel of at least one of some key views."""
-    is_seen = jnp.zeros(gaussians.opacities.shape, bool)
-    for i in range(views.shape[0]):
-        is_seen |= may_be_seen(gaussians, key_views.camera(views[i]))
-    return is_seen
+    return functools.reduce(jnp.logical_or, (may_be_seen(gaussians, key_views.camera(slot)) for slot in views))
 
 
 def may_be_seen(gaussians: Gaussians, camera: Camera) -> Bool[Array, " n"]:

@@ -15,15 +15,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import PROCEDURAL_SIZE, is_capture, open_capture, without_tilde
 from ssplat_jax.data.posed_image import split_options, with_options
-from ssplat_jax.data.split import (
-    Index,
-    Split,
-    choose_split,
-    index_to_json,
-    interleaved_split,
-    read_index,
-    split_of_scene,
-)
+from ssplat_jax.data.split import Index, Split, choose_split, index_to_json, read_index, split_of_scene
 from ssplat_jax.evaluation.cost import OOM
 from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.pictures import save_image
@@ -224,7 +216,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
     session.least_decoded = SHOWN_PIVOTS
     session.compile_ahead(*PROCEDURAL_SIZE, STAGES[-1])
     capture = open_capture(f"procedural:{scene}")  # 64 context views and the 9 interleaved targets between them
-    split = interleaved_split(len(capture), stride=1, context=STAGES[-1])
+    split = choose_split("interleaved", len(capture), 1, STAGES[-1])
     stream_frame = capture.stream_frame(model.config, split.context)
     order = capture.stream_order(model.config, split.context, stream_frame)
     exposures: Exposures = {}

@@ -200,9 +200,8 @@ class SavedRun:
             InputError: they are others.
         """
         if self.header["weights"] != params_digest(params):
-            raise InputError(
-                f"{self.folder.path}: was streamed with other weights than these; give the run's own with --weights."
-            )
+            fix = "give the run's own with --weights"
+            raise InputError(f"{self.folder.path}: was streamed with other weights than these; {fix}.")
         return Session(StreamSplat(StreamConfig.from_dict(self.header["config"])), params, self.cache)
 
     def open_capture(self, path: str) -> Capture:

@@ -10,11 +10,11 @@ import numpy as np
 
 from ssplat_jax.core.console import WAITING, Reporter
 from ssplat_jax.core.errors import refusal, require_positive
-from ssplat_jax.evaluation.scoring import mean_scores, score_targets
+from ssplat_jax.evaluation.scoring import mean_scores, score_views
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, key_views_of
 from ssplat_jax.runs.open_run import load_run
-from ssplat_jax.runs.run_results import picture_views, report_run, save_scene, shown_frames
+from ssplat_jax.runs.run_results import report_run, save_scene, shown_frames
 from ssplat_jax.runs.stream_commands import Refine, stopped
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder, lock_folder
@@ -70,12 +70,12 @@ def refine_run(params: dict, options: Refine, reporter: Reporter) -> int:
             save_scene(folder.refined_scene, refined, stream_frame, exposures)  # at the exposure of scene.ply
             if interrupts.received:  # read last: a signal may have come during the save, too
                 return stopped(interrupts.received, f"after {progress.num_steps} steps", overwrites=options.overwrite)
-        before = score_targets(gaussians, capture, tuple(shown_frames(indices)), stream_frame, exposures)
-        scores = picture_views(folder, refined, capture, indices, stream_frame, exposures)
+        frames = shown_frames(indices)
+        before = mean_scores(score_views(gaussians, capture, frames, stream_frame, exposures))
+        scores = score_views(refined, capture, frames, stream_frame, exposures, picture=folder.view)
         after = mean_scores(scores)
-        write_json(
-            folder.refinement, vars(progress.report()) | {"seen_views_before": before, "seen_views_after": after}
-        )
+        seen = {"seen_views_before": before, "seen_views_after": after}
+        write_json(folder.refinement, vars(progress.report()) | seen)
         if folder.metrics.is_file():  # else there is no report to bring up to date
             metrics = json.loads(folder.metrics.read_text())
             report_run(folder, metrics, options.path, run.header["weights"], refined=scores)

@@ -14,11 +14,10 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.numerics import evenly_spread
-from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import peak_memory
 from ssplat_jax.evaluation.pictures import report_page
-from ssplat_jax.evaluation.scoring import ViewScore, exposures_to_json, score_view
+from ssplat_jax.evaluation.scoring import ViewScore, exposures_to_json, score_views
 from ssplat_jax.runs.open_run import OpenRun
 from ssplat_jax.scene_files.formats import ExportReport, save_gaussians
 from ssplat_jax.storage.chunk_records import ChunkRecord, load_chunk_records
@@ -91,7 +90,8 @@ def finish_run(run: OpenRun, path: str, reporter: Reporter) -> int:
         reporter.warn(f"{folder.scene.name}: {report.warning}")
     reporter.say(f"{folder.scene} is written; pictures and figures follow")
     folder.clear_views()
-    scores = picture_views(folder, gaussians, capture, run.indices, stream_frame, run.exposures)
+    frames = shown_frames(run.indices)
+    scores = score_views(gaussians, capture, frames, stream_frame, run.exposures, picture=folder.view)
     middle = capture.camera(run.indices[len(run.indices) // 2], stream_frame)
     metrics = {
         "capture": capture.name,
@@ -117,27 +117,6 @@ def finish_run(run: OpenRun, path: str, reporter: Reporter) -> int:
 def shown_frames(indices: Sequence[int]) -> list[int]:
     """A few of the frames, evenly spread."""
     return [indices[k] for k in evenly_spread(len(indices), NUM_PICTURES)]
-
-
-def picture_views(
-    folder: RunFolder,
-    gaussians: Gaussians,
-    capture: Capture,
-    indices: Sequence[int],
-    stream_frame: StreamFrame,
-    exposures: Exposures,
-) -> list[ViewScore]:
-    """Scores of a few of the streamed frames, with a picture of each in `views/`: photograph, scene and depth.
-
-    Raises:
-        StorageError: a picture cannot be written.
-    """
-    scores = []
-    for i in shown_frames(indices):
-        view = score_view(gaussians, capture, i, stream_frame, exposures)
-        view.save(folder.view(i), stream_frame.depth_range)
-        scores.append(view.score)
-    return scores
 
 
 def finished_scene(folder: RunFolder, num_views: int) -> int | None:
@@ -254,7 +233,5 @@ def _stream_rows(records: Sequence[ChunkRecord]) -> list[tuple[str, ...]]:
 def _caption(score: dict[str, Any], kind: str) -> str:
     """Frame and scores of a picture."""
     shown, literal = score["shown"], score["literal"]
-    return (
-        f"{kind} frame {score['frame']} · shown {shown['psnr']:.2f} dB, SSIM {shown['ssim']:.3f}"
-        f" · literal {literal['psnr']:.2f} dB"
-    )
+    told = f"shown {shown['psnr']:.2f} dB, SSIM {shown['ssim']:.3f}"
+    return f"{kind} frame {score['frame']} · {told} · literal {literal['psnr']:.2f} dB"

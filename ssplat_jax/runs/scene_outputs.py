@@ -24,6 +24,7 @@ from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.core.pytree import replace
+from ssplat_jax.data.posed_image import Matrix, Pose
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.metrics import psnr
 from ssplat_jax.evaluation.pictures import VideoWriter, save_image
@@ -36,9 +37,6 @@ from ssplat_jax.scene_files.formats import SCENE_READERS, ExportReport, file_axe
 from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
 from ssplat_jax.streaming.session import middle_exposure
-
-Pose = Float64[np.ndarray, "4 4"]
-Intrinsics = Float64[np.ndarray, "3 3"]
 
 _jitted_fill_holes = Kept(fill_holes)
 
@@ -201,7 +199,7 @@ def render_run(options: Render, reporter: Reporter) -> int:
     background = mean_color(splats)  # of holes that have no colors around them
     at_camera = replace(splats, offset=(0.0, 0.0, 0.0))  # cameras are relative to it already
 
-    def picture(camtoworld: Pose, K: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+    def picture(camtoworld: Pose, K: Matrix) -> Float[np.ndarray, "h w 3"]:
         """The scene from one camera of the capture's frame."""
         camera = _camera_at(camtoworld, K, size, splats.offset)
         out = render(at_camera, camera, effects=effects_for(at_camera, camera))
@@ -225,7 +223,7 @@ def render_run(options: Render, reporter: Reporter) -> int:
     return len(indices)
 
 
-def _camera_at(camtoworld: Pose, K: Intrinsics, size: tuple[int, int], offset: tuple[float, float, float]) -> Camera:
+def _camera_at(camtoworld: Pose, K: Matrix, size: tuple[int, int], offset: tuple[float, float, float]) -> Camera:
     """A camera of the capture's frame, relative to a point of it: float32 cannot hold places far from zero."""
     viewmat = StreamFrame.at_point(offset).viewmats(camtoworld)
     return Camera(jnp.asarray(viewmat), jnp.asarray(K, jnp.float32), width=size[0], height=size[1])

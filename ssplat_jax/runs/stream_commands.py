@@ -112,10 +112,8 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
                 raise InputError(f"--set {name}: wanted a value like {held!r}, got {text!r}.")
         before, first = given.setdefault((group, field), (value, change))
         if before != value:
-            raise InputError(
-                f"--set: wanted one value of {group}.{field}, got {first} and {change}: drop one; --causal and"
-                f" --watch set stream.causal, --online-refine sets stream.steps_per_chunk."
-            )
+            fix = "drop one; --causal and --watch set stream.causal, --online-refine sets stream.steps_per_chunk"
+            raise InputError(f"--set: wanted one value of {group}.{field}, got {first} and {change}: {fix}.")
         parsed[name] = value
     return config.replace(**parsed)
 
@@ -314,10 +312,8 @@ class Eval(StreamOptions):
             f" {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/report.html, {self.out}/metrics.json"
         )
         if refined := metrics.get("refinement"):
-            print(
-                f"before {refined['num_steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"
-                f" {_both_scores(refined['before'])}"
-            )
+            count, seconds = refined["num_steps"], refined["seconds_per_step"]
+            print(f"before {count} refinement steps of {seconds:.2f} s: {_both_scores(refined['before'])}")
         return 0
 
 
@@ -354,10 +350,8 @@ class Demo:
         with lock_folder(self.out):
             run_demo(self.scene, self.out, reporter)
         print(f"wrote {self.out}/scene.ply, metrics.json and pictures")
-        reporter.say(
-            f"next: `ssplat view {self.out}` shows the scene in a browser; `ssplat run CAPTURE --out runs/mine` makes"
-            " one of your own images"
-        )
+        mine = "`ssplat run CAPTURE --out runs/mine` makes one of your own images"
+        reporter.say(f"next: `ssplat view {self.out}` shows the scene in a browser; {mine}")
         return 0
 
 

@@ -56,9 +56,8 @@ def encode_ply(rows: SplatRows) -> bytes:
     logits = np.log(rows.opacities) - np.log1p(-rows.opacities)
     normals = np.zeros_like(rows.means)
     columns = [rows.means, normals, rows.sh[:, 0], rest, logits[:, None], rows.log_scales, rows.quats]
-    return (
-        "\n".join([*header, "end_header\n"]).encode("ascii") + np.concatenate(columns, axis=1).astype("<f4").tobytes()
-    )
+    head = "\n".join([*header, "end_header\n"]).encode("ascii")
+    return head + np.concatenate(columns, axis=1).astype("<f4").tobytes()
 
 
 def decode_ply(data: bytes) -> SplatRows:

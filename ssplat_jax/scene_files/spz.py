@@ -22,15 +22,7 @@ from jaxtyping import Float64, UInt8, UInt32
 
 from ssplat_jax.core.errors import refusal
 from ssplat_jax.core.rotations import sh_rotation
-from ssplat_jax.scene_files.splat_rows import (
-    HALF_RANGE,
-    SplatRows,
-    check_sizes,
-    drop_largest,
-    placed,
-    to_bytes,
-    with_largest,
-)
+from ssplat_jax.scene_files.splat_rows import SplatRows, check_sizes, drop_largest, placed, to_bytes, with_largest
 
 MAGIC = b"NGSP"
 VERSIONS = (4, 3)  # versions that are written, the usual one first
@@ -185,5 +177,5 @@ def _joined_frames(data: bytes, table: int, sizes: list[int]) -> bytes:
 def _unpack_rotations(rows: UInt8[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
     words = np.ascontiguousarray(rows).view("<u4")[:, 0]
     parts = np.stack([words >> shift & 1023 for shift in (20, 10, 0)], axis=1).astype(np.int64)
-    sizes = (parts & 511) / 511 * HALF_RANGE
+    sizes = (parts & 511) / 511 * np.sqrt(0.5)
     return with_largest((words >> 30).astype(np.int64), np.where(parts & 512, -sizes, sizes))

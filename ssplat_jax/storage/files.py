@@ -84,16 +84,14 @@ def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str,
     except OSError as error:
         raise StorageError(f"{path}: cannot be read ({error.strerror or error}).") from error
     if _hex_digest(memoryview(contents)[:-_DIGEST_LENGTH]) != contents[-_DIGEST_LENGTH:]:
-        raise StorageError(
-            f"{path}: the file is corrupt (its checksum does not match); restore it from a backup or create it again."
-        )
+        fix = "restore it from a backup or create it again"
+        raise StorageError(f"{path}: the file is corrupt (its checksum does not match); {fix}.")
     with np.load(io.BytesIO(contents), allow_pickle=False) as archive:
         arrays = dict(archive)
     facts = json.loads(arrays.pop(_HEADER).tobytes())
     if facts["kind"] != kind:
-        raise StorageError(
-            f"{path}: wanted a file of {kind}, got one of {facts['kind']}; create a file of another version again."
-        )
+        fix = "create a file of another version again"
+        raise StorageError(f"{path}: wanted a file of {kind}, got one of {facts['kind']}; {fix}.")
     arrays |= {name: arrays[name].view(getattr(ml_dtypes, dtype)) for name, dtype in facts["dtypes"].items()}
     return arrays, facts["header"]
 

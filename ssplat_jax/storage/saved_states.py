@@ -18,14 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.cache.state import (
-    OPTIONAL_PIVOT_FIELDS,
-    PIVOT_FIELDS,
-    CacheStats,
-    StoredDepths,
-    VoxelCache,
-    require_single_cache,
-)
+from ssplat_jax.cache.state import ROW_FIELDS, CacheStats, StoredDepths, VoxelCache, require_single_cache
 from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import InputError, StorageError, echo
 from ssplat_jax.storage.files import load_arrays, save_arrays
@@ -35,7 +28,6 @@ KIND = "stream state 1"
 ANEW = "choose another --out, repeat the old options, or start anew with --overwrite"
 
 _DIGEST = "sha256"  # name of the digest among the leaves of a checkpoint, which are numbered
-_ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, *OPTIONAL_PIVOT_FIELDS)  # arrays with one row per voxel
 _GROUPS = {"stats": CacheStats, "stored_depths": StoredDepths, "key_views": KeyViews}  # parts with fields of their own
 
 
@@ -52,7 +44,7 @@ def save_state(path: Path, cache: VoxelCache, header: dict[str, Any]) -> None:
     for keys, leaf in jax.tree_util.tree_flatten_with_path(cache)[0]:
         name = ".".join(key.name for key in keys)
         # Sliced on the host: JAX would compile a program for each number of voxels, which differs at every save.
-        array = np.asarray(leaf)[:num_voxels] if name in _ROW_FIELDS else np.asarray(leaf)
+        array = np.asarray(leaf)[:num_voxels] if name in ROW_FIELDS else np.asarray(leaf)
         leaves[name] = np.ascontiguousarray(array).reshape(array.shape)
     save_arrays(path, leaves, KIND, {"capacity": cache.capacity, "caller": header}, keep_previous=True)
 
@@ -63,7 +55,7 @@ def load_state(path: Path) -> tuple[VoxelCache, dict[str, Any]]:
     fields: dict[str, Any] = {}
     groups: dict[str, dict[str, Any]] = {}
     for name, leaf in leaves.items():
-        if name in _ROW_FIELDS:  # as long as the capacity again
+        if name in ROW_FIELDS:  # as long as the capacity again
             leaf = np.pad(leaf, [(0, facts["capacity"] - len(leaf)), *[(0, 0)] * (leaf.ndim - 1)])
         *owner, field = name.split(".")
         (groups.setdefault(owner[0], {}) if owner else fields)[field] = jax.device_put(leaf)  # jnp.asarray compiles
@@ -165,10 +157,8 @@ class TrainingCheckpoints:
                     os.replace(self.directory / "checkpoints" / str(damaged), aside)
                 return step, state
         if steps:
-            raise StorageError(
-                f"{self.directory}: checkpoints {', '.join(map(str, steps))} are damaged or of another version; choose"
-                " another --out."
-            )
+            numbers, fix = ", ".join(map(str, steps)), "choose another --out"
+            raise StorageError(f"{self.directory}: checkpoints {numbers} are damaged or of another version; {fix}.")
         return None
 
     def _manager(self):

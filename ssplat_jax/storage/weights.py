@@ -103,10 +103,8 @@ def _path_of(name: str) -> Path:
     if file.is_file():
         return file
     if name in PRESETS:
-        raise InputError(
-            f"weights: none ship with the preset {name!r}; convert ReSplat's (ssplat import-weights) or train"
-            f" (ssplat train --preset {name}), and give the file."
-        )
+        fix = f"convert ReSplat's (ssplat import-weights) or train (ssplat train --preset {name}), and give the file"
+        raise InputError(f"weights: none ship with the preset {name!r}; {fix}.")
     known = ", ".join(preset for preset in sorted(PRESETS) if (SHIPPED / f"{preset}.npz").is_file())
     raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
 
@@ -181,9 +179,8 @@ def _restore(path: Path | str, arrays: Mapping[str, Any], config: StreamConfig, 
         name = "/".join(k.key for k in keys)
         if name not in arrays or arrays[name].shape != shape.shape:
             came = arrays[name].shape if name in arrays else "nothing"
-            raise InputError(
-                f"{path}: {name} must be {shape.shape}, got {came}; the weights belong to another configuration."
-            )
+            why = "the weights belong to another configuration"
+            raise InputError(f"{path}: {name} must be {shape.shape}, got {came}; {why}.")
         return jax.device_put(np.asarray(arrays[name], np.float32))  # jnp.asarray compiles a program for each shape
 
     return jax.tree_util.tree_map_with_path(leaf, _shapes(config) if shapes is None else shapes)
@@ -280,10 +277,8 @@ def import_params(path: Path, config: StreamConfig, *, depth_only: bool = False)
     usable = {name: shapes[name] for name in shapes if name in found and (name.startswith(DEPTH) or not depth_only)}
     initialized_parts = _initialized_parts(path, by_place, usable)
     if not usable:
-        raise InputError(
-            f"{path}: wanted weights of ReSplat, its depth network or Depth Anything V2; the file has none of their"
-            f" {len(shapes)} tensors."
-        )
+        wanted = "weights of ReSplat, its depth network or Depth Anything V2"
+        raise InputError(f"{path}: wanted {wanted}; the file has none of their {len(shapes)} tensors.")
     for name, shape in usable.items():
         if (got := found[name].shape) != shape:
             raise InputError(f"{path}: wanted {name} of shape {shape}, got {got}; is it another network's?")

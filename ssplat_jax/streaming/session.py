@@ -208,10 +208,8 @@ class Session:
         key = _program_key(name, cache, chunk)
         if key not in self._programs:
             since, ahead = time.perf_counter(), self._ahead.pop(key, None)
-            if ahead is not None:
-                self._programs[key] = ahead.result()
-            else:
-                self._programs[key] = Kept(function, donate_argnums=(1,)).program(self.params, cache, chunk, *more)
+            new = Kept(function, donate_argnums=(1,))
+            self._programs[key] = ahead.result() if ahead else new.program(self.params, cache, chunk, *more)
             self.compile_seconds += time.perf_counter() - since
             self.num_compilations += 1
         return self._programs[key]

@@ -77,9 +77,8 @@ class StreamParts:
             rng = np.random.default_rng([start.seed, number, 19])
             chunk = kept[rng.integers(len(kept))]
             free = [max(whole - side, 0) for whole, side in zip(chunk.usable.shape[1:], self.size, strict=True)]
-            rows, columns = (
-                slice(k, k + side) for k, side in zip(rng.integers(0, free, endpoint=True), self.size, strict=True)
-            )
+            firsts = rng.integers(0, free, endpoint=True)
+            rows, columns = (slice(k, k + side) for k, side in zip(firsts, self.size, strict=True))
             cut = lambda x: np.asarray(x)[:, rows, columns]  # noqa: E731
             as_floats = lambda x: jnp.asarray(x, jnp.float32 if x.dtype == np.float16 else x.dtype)  # noqa: E731
             return AnchorSample(

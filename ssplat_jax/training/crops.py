@@ -113,9 +113,8 @@ class Crops:
         # All places at once, so that they do not depend on where a training was resumed.
         for number in range(self.batch * start.num_steps):
             num_views, height, width = scenes[number % len(scenes)][1].images.shape[:3]
-            places.append(
-                [int(rng.integers(n)) for n in (num_views, height - self.size[0] + 1, width - self.size[1] + 1)]
-            )
+            sides = (num_views, height - self.size[0] + 1, width - self.size[1] + 1)
+            places.append([int(rng.integers(n)) for n in sides])
 
         def place(number: int) -> tuple[VoxelCache, KeyViews, Camera, slice, slice]:
             (cache, views), (view, row, column) = scenes[number % len(scenes)], places[number]

@@ -35,6 +35,7 @@ from ssplat_jax.training.samples import Sample
 Scalar = Float[Array, ""]
 Metrics = dict[str, Array]
 Lpips = LpipsWeights | None
+Value = tuple[Scalar, Metrics]  # of a loss, and what is logged
 
 MIN_STEP = 1e-6  # smallest step of log depth between candidates that is divided by; steps are 0 where near = far
 MAX_GAIN = 2.0
@@ -100,9 +101,7 @@ class AnchorLoss:
     target_width: float = 0.6  # see `DepthLoss`
     renders: ClassVar[bool] = False
 
-    def __call__(
-        self, model: StreamSplat, params: dict, batch: AnchorSample, lpips: Lpips = None
-    ) -> tuple[Scalar, Metrics]:
+    def __call__(self, model: StreamSplat, params: dict, batch: AnchorSample, lpips: Lpips = None) -> Value:
         """Mean loss of the samples along the leading axis of `batch`, and beside it the L1 without the anchor."""
 
         def of_sample(sample: AnchorSample) -> tuple[Scalar, Metrics]:
@@ -209,9 +208,7 @@ class CropLoss:
     lpips_weight: float = 20.0  # decibels that an LPIPS of 1 counts; without its weights the PSNR stands alone
     renders: ClassVar[bool] = False
 
-    def __call__(
-        self, model: StreamSplat, params: dict, batch: tuple[CropSample, ...], lpips: Lpips = None
-    ) -> tuple[Scalar, Metrics]:
+    def __call__(self, model: StreamSplat, params: dict, batch: tuple[CropSample, ...], lpips: Lpips = None) -> Value:
         """Mean over the crops of `batch`, and their PSNRs in dB."""
 
         def of_crop(crop: CropSample) -> tuple[Scalar, Metrics]:

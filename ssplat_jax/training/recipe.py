@@ -150,9 +150,7 @@ alone, trusts the cache too far (docs/model_card.md)."""
 
 # The matcher is trained by then. Without its backward pass a step costs a third, and rendering would teach it less
 # about depth than depth supervision did.
-STREAM_RECIPE = Recipe(
-    phases=(Phase("stream", 400, _FOUR_CHUNKS, RenderingLoss(), AFTER_MATCHER, 1e-3, final_share=0.02),)
-)
+STREAM_RECIPE = Recipe((Phase("stream", 400, _FOUR_CHUNKS, RenderingLoss(), AFTER_MATCHER, 1e-3, final_share=0.02),))
 """Trains the stages behind a trained matcher. The shipped weights do not include it, because it lowered the scores
 of captures (docs/model_card.md)."""
 

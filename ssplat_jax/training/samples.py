@@ -1,7 +1,6 @@
 """Samples of streamed views, procedural or of a capture: chunks of context views with true depths, and target views.
 
-`CaptureMix` holds the captures that a training learns from, beside procedural scenes, and `ViewSamples` says what the
-samples of a phase are. Every 8th frame of a capture from the 5th on, a target of the interleaved protocol, is held out:
+Every 8th frame of a capture from the 5th on, a target of the interleaved protocol, is held out:
 samples of views show it neither as context nor as target, and `ssplat eval` scores it.
 """
 
@@ -288,11 +287,9 @@ def capture_sample(
     known, jitter = mix.frame_of(capture), views.range_jitter
     context = delivered.stream_order(mix.config, context, known)
     scale, near, far = np.exp(rng.uniform(-jitter, jitter, 3))
+    first = capture.frames[context[0]].camtoworld
     stream_frame = StreamFrame.at_camera(
-        capture.frames[context[0]].camtoworld,
-        scale=known.scale * scale,
-        near=known.near * scale * near,
-        far=known.far * scale * far,
+        first, scale=known.scale * scale, near=known.near * scale * near, far=known.far * scale * far
     )
     frames = [*context, *targets]
     return _sample_of_views(

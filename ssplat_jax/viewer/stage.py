@@ -1,8 +1,5 @@
 """Scenes on disk that may change while they are viewed, and `Stage`, the scene that all browsers look at.
 
-A scene is a file, or a run that is still streaming: with `--deltas` it writes a file per chunk. The viewer reads these
-in a process of its own, so that the stream waits for no browser, and viewers may come and go.
-
 Browsers are sent splats, or pictures by our rasterizer. viser clips what is nearer than 0.01 or farther than 1000.
 Lengths are therefore divided by `distance`, so that the first camera looks at a point at distance 1. It stores
 covariances as 16-bit floats, in which a Gaussian of 1e-4 units vanishes: Gaussians are sent in units of the scene's
@@ -164,10 +161,8 @@ def open_source(path: Path) -> Source:
     if folder.deltas.is_dir() and (folder.delta_files() or not file.is_file()):
         return GrowingScene(folder)
     if not file.is_file():
-        raise InputError(
-            f"{path}: wanted a scene file, or the folder of an `ssplat run` that has ended or writes --deltas, found"
-            " neither; wait for its scene, or check the path."
-        )
+        wanted = "a scene file, or the folder of an `ssplat run` that has ended or writes --deltas"
+        raise InputError(f"{path}: wanted {wanted}, found neither; wait for its scene, or check the path.")
     return SceneFile(file)
 
 
@@ -310,10 +305,8 @@ def visible_splats(gaussians: Gaussians, unit: float, max_gaussians: int) -> dic
     if len(rows) > max_gaussians:
         growth = np.sqrt(len(rows) / max_gaussians)
         rows = rows[np.linspace(0, len(rows) - 1, max_gaussians).round().astype(int)]
-    means, quats, scales, opacities, dc = (
-        np.asarray(x)[rows]
-        for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh[:, 0])
-    )
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh[:, 0])
+    means, quats, scales, opacities, dc = (np.asarray(x)[rows] for x in fields)
     sigmas = np.clip(growth * scales / unit, 0.0, MAX_SIGMA)
     axes = np.asarray(quats_to_matrices(jnp.asarray(quats))) * sigmas[:, None, :]
     splats = {

@@ -109,7 +109,6 @@ def test_range_is_bounded_and_scales(median, spread_near, spread_far):
         median=median,
         q99=median * spread_far,
         num_points=100,
-        num_pairs=10,
         parallax_degrees=4.0,
         source="matches",
     )

@@ -158,9 +158,8 @@ def _shade(
     face_idx, unit_normal = _faces(local, solid_idx)
     normal = [sum(frame[4 * i + j] * unit_normal[i] for i in range(3)) for j in range(3)]
     length = jnp.sqrt(sum(n * n for n in normal))
-    facing = jnp.abs(sum(n * d for n, d in zip(normal, rays, strict=True))) / (
-        length * jnp.sqrt(sum(d * d for d in rays))
-    )
+    reach = jnp.sqrt(sum(d * d for d in rays))
+    facing = jnp.abs(sum(n * d for n, d in zip(normal, rays, strict=True))) / (length * reach)
     outward = jnp.where(solid_idx >= NUM_SOLIDS, -1.0, 1.0)
     lambert = outward * sum(n * scene.light[j] for j, n in enumerate(normal)) / length
 

@@ -55,16 +55,9 @@ def scale_scene(scene: Scene, factor: float) -> Scene:
     frames = np.concatenate([scene.frames[..., :3] / f, scene.frames[..., 3:]], axis=-1)
     faces = np.array(scene.faces)
     faces[..., 8] /= f
-    return replace(
-        scene,
-        frames=frames,
-        halves=scene.halves * f,
-        faces=faces,
-        occlusion_reach=np.asarray(scene.occlusion_reach * f),
-        focus=scene.focus * f,
-        orbit_radius=np.asarray(scene.orbit_radius * f),
-        eye=scene.eye * f,
-    )
+    names = ("halves", "occlusion_reach", "focus", "orbit_radius", "eye")
+    lengths = {name: np.asarray(getattr(scene, name) * f) for name in names}
+    return replace(scene, frames=frames, faces=faces, **lengths)
 
 
 def fade_scene(scene: Scene, contrast: float) -> Scene:

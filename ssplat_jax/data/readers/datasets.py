@@ -18,7 +18,6 @@ from ssplat_jax.data.readers.frame_list import (
     Intrinsics,
     Listing,
     Reader,
-    file_named,
     files_in,
     files_with,
     find_file,
@@ -37,7 +36,7 @@ from ssplat_jax.data.readers.frame_list import (
 def _read_scannet(path: Path, convention: Convention) -> Listing:
     """The tracked frames."""
     frames = FrameList(path, convention)
-    file = file_named(frames.root, "intrinsic/intrinsic_color.txt", f"{path}: intrinsics")
+    file = frames.file_named("intrinsic/intrinsic_color.txt", f"{path}: intrinsics")
     intrinsics, images = pinhole(load_rows(file, 4), str(file)), images_in(frames.root / "color")
     for image in images:
         pose_file = find_file(frames.root, [f"pose/{image.stem}.txt"], str(image))
@@ -82,8 +81,8 @@ def _read_tum(path: Path, convention: Convention) -> Listing:
     poses = load_rows(root / "groundtruth.txt", 8)
     poses = poses[np.isfinite(poses).all(axis=1)]  # others say that tracking was lost
     poses = poses[np.argsort(poses[:, 0], kind="stable")]
-    listed, notes = _listed_files(root, "rgb.txt")
-    depths, depth_notes = _listed_files(root, "depth.txt") if (root / "depth.txt").is_file() else ([], [])
+    listed, notes = _listed_files(frames, "rgb.txt")
+    depths, depth_notes = _listed_files(frames, "depth.txt") if (root / "depth.txt").is_file() else ([], [])
     images = {file: time for time, file in reversed(listed)}  # each at its first time
     if len(images) < len(listed):
         again = len(listed) - len(images)
@@ -111,19 +110,19 @@ def _depth_factor(root: Path) -> float | None:
     return None
 
 
-def _listed_files(root: Path, name: str) -> tuple[list[tuple[float, Path]], list[str]]:
+def _listed_files(frames: FrameList, name: str) -> tuple[list[tuple[float, Path]], list[str]]:
     """(time, file) of a list of files, in the order of time, and a note about listed files that do not exist."""
     found, missing = [], []
-    for where, line in load_lines(root / name):
+    for where, line in load_lines(frames.root / name):
         if line:
             time, *file_name = line.split(maxsplit=1)
             if not file_name:
                 raise refusal(where, wanted="a time and a file", got=echo(line), fix=AGAIN)
-            file = find_image(root, file_name[0], where)
+            file = find_image(frames.root, file_name[0], where)
             found.append((parse_numbers([time], where)[0], file))
             missing += [(file_name[0], where)] if file is None else []
     if missing and len(missing) == len(found) and name == "rgb.txt":
-        file_named(root, *missing[0])  # refuses it
+        frames.file_named(*missing[0])  # refuses it
     notes = [f"{len(missing)} files of {name} are missing and left out."] if missing else []
     return sorted((time, file) for time, file in found if file is not None), notes
 

@@ -134,7 +134,14 @@ class FrameList:
 
     def named(self, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path:
         """The path that `find` finds; there must be one."""
-        return self.find(name, where, suffixes) or file_named(self.root, f"{self.folder}{name}", where)
+        return self.find(name, where, suffixes) or self.file_named(f"{self.folder}{name}", where)
+
+    def file_named(self, name: object, where: str) -> Path:
+        """The path that `find_image` finds; there must be one."""
+        if (path := find_image(self.root, name, where)) is None:
+            got = f"{echo(name)}, where there is none"
+            raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
+        return path
 
     def add(
         self,
@@ -236,7 +243,7 @@ class FrameList:
         """
         lost = num_listed - len(self.frames)
         if not self.frames and self._first_missing is not None:
-            file_named(self.root, *self._first_missing)  # refuses it
+            self.file_named(*self._first_missing)  # refuses it
         if not self.frames:
             got = f"none of {num_listed} with its {missing}"
             raise refusal(str(self.root), wanted="frames with images and poses", got=got, fix="complete the capture")
@@ -354,15 +361,6 @@ def find_image(root: Path, name: object, where: str, suffixes: Sequence[str] = (
     copies = [] if below is None else [f"{folder}/{below}" for folder in SHRUNK_FOLDERS]
     renamed = [posixpath.splitext(copy)[0] + suffix for copy in copies for suffix in SUFFIXES]
     return find_file(root, [n + suffix for n in (name, *slashed, *copies) for suffix in suffixes] + renamed, where)
-
-
-def file_named(root: Path, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path:
-    """The path that `find_image` finds; there must be one."""
-    path = find_image(root, name, where, suffixes)
-    if path is None:
-        got = f"{echo(name)}, where there is none"
-        raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
-    return path
 
 
 def in_images(name: str) -> str | None:

@@ -10,7 +10,6 @@ k1 k2 k3 k4 p1 p2, and with FULL_OPENCV k4 to k6 are the denominator. Depth maps
 count steps of `integer_depth_scale`, else millimeters times `applied_scale`. Frames with `is_bad` (ScanNet++) are left
 out. Without a transforms.json, the split transforms_train.json is read.
 DL3DV keeps the file and its images in a folder `nerfstudio`, which is opened with the folder around it.
-Frames are streamed in the natural order of `file_path`, with the exception in `frame_list.in_stream_order`.
 """
 
 import math
@@ -21,16 +20,7 @@ from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.data.images import FisheyeLens, Lens, image_size
 from ssplat_jax.data.parsing import UNDISTORT, Fields, load_json
 from ssplat_jax.data.posed_image import MILLIMETER, Convention
-from ssplat_jax.data.readers.frame_list import (
-    SUFFIXES,
-    FrameList,
-    Intrinsics,
-    Listing,
-    Reader,
-    file_named,
-    in_images,
-    stored_size,
-)
+from ssplat_jax.data.readers.frame_list import SUFFIXES, FrameList, Intrinsics, Listing, Reader, in_images, stored_size
 from ssplat_jax.data.readers.programs import SPLAT_CAMERAS
 
 PLACES = ("transforms.json", "nerfstudio/transforms.json", "transforms_train.json")
@@ -101,7 +91,7 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
     image = frames.named(name, f"{where}.file_path", ("", *SUFFIXES))
     depth_kind = "depth_path" if own.get("depth_file_path") is None else "depth_file_path"
     depth, mask = (
-        None if own.get(kind) is None else file_named(frames.root, own.get(kind), f"{where}.{kind}")
+        None if own.get(kind) is None else frames.file_named(own.get(kind), f"{where}.{kind}")
         for kind in (depth_kind, "mask_path")
     )
     is_shrunk = in_images(str(name)) is not None and not (frames.root / "images").is_dir()

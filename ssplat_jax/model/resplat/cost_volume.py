@@ -8,12 +8,13 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import invert_poses, pixel_grid, unproject
 from ssplat_jax.core.numerics import bilinear_taps, correlate_warped
-from ssplat_jax.model.layers import Conv, HalvingConv, attend
+from ssplat_jax.model.layers import Conv, HalvingConv, UNetBlock, attend
 from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures, group_norm, resize
 from ssplat_jax.model.views import MIN_SOURCE_DEPTH, DepthDistribution, Views, mean_over_sources, sweep_pixels
 
 WIDTH = 128  # channels of the U-Net
 HEADS = 4  # heads of the joint attention
+NAMES = ("in_layers_0", "in_layers_2", "out_layers_0", "out_layers_3", "skip_connection")  # of a block's parameters
 
 
 def upstream_sweep_pixels(
@@ -67,17 +68,6 @@ def plane_sweep(features: ReSplatFeatures, views: Views, config: StreamConfig) -
     return mean.transpose(0, 2, 3, 1) * c**-0.5
 
 
-class ResBlock(nn.Module):
-    """Residual block: twice GroupNorm - SiLU - conv. The last convolution starts at zero."""
-
-    @nn.compact
-    def __call__(self, x):
-        y = Conv(WIDTH, name="in_layers_2")(nn.silu(group_norm("in_layers_0")(x)))
-        y = nn.silu(group_norm("out_layers_0")(y))
-        y = Conv(WIDTH, kernel_init=nn.initializers.zeros, name="out_layers_3")(y)
-        return (x if x.shape[-1] == WIDTH else Conv(WIDTH, 1, name="skip_connection")(x)) + y
-
-
 class ReSplatJointAttention(nn.Module):
     """Residual self-attention over the cells of all views of a chunk."""
 
@@ -112,7 +102,7 @@ class ReSplatUNet(nn.Module):
 
     @nn.compact
     def __call__(self, x, view_valid):
-        res = lambda name: ResBlock(name=name)  # noqa: E731
+        res = lambda name: UNetBlock(WIDTH, NAMES, group_norm, name=name)  # noqa: E731
         joint = lambda name: ReSplatJointAttention(name=name)  # noqa: E731
         x = Conv(WIDTH, name="input_blocks_0_0")(x)
         skips = [x]
@@ -141,11 +131,9 @@ class ReSplatCostVolume(nn.Module):
         stride = self.config.network.match_stride
         mono = resize(resize(features.mono[-1], hm * stride // 8, wm * stride // 8), hm, wm)
         x = jnp.concatenate([cost, features.cnn[-1], features.multiview, mono], axis=-1)
-        y = Conv(WIDTH, name="regressor_0_0")(x)
-        y = group_norm("regressor_0_1")(y)
+        y = group_norm("regressor_0_1")(Conv(WIDTH, name="regressor_0_0")(x))
         y = ReSplatUNet(name="regressor_0_3")(nn.gelu(y, approximate=False), view_valid)
-        y = Conv(WIDTH, name="regressor_0_4")(y)
-        decoder = y + Conv(WIDTH, 1, name="regressor_residual_0")(x)
+        decoder = Conv(WIDTH, name="regressor_0_4")(y) + Conv(WIDTH, 1, name="regressor_residual_0")(x)
         hidden = nn.gelu(Conv(2 * WIDTH, padding="edge", name="depth_head_0_0")(decoder), approximate=False)
         logits = Conv(self.config.network.num_depths, padding="edge", name="depth_head_0_2")(hidden)
         return DepthDistribution(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)

@@ -11,8 +11,8 @@ from ssplat_jax.model.layers import (
     HalvingConv,
     Mlp,
     ResidualBlock,
+    SelfAttention,
     WindowAttention,
-    attend,
     attend_in_windows,
     instance_norm,
     layer_norm,
@@ -126,18 +126,6 @@ def _cubic_weights(size: int) -> np.ndarray:
     return weights
 
 
-class Attention(nn.Module):
-    """Self-attention among the tokens of each view."""
-
-    heads: int
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "v n c"]) -> Float[Array, "v n c"]:
-        v, n, c = x.shape
-        qkv = nn.Dense(3 * c, name="qkv")(x).reshape(v, n, 3, self.heads, c // self.heads)
-        return nn.Dense(c, name="proj")(attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2]).reshape(v, n, c))
-
-
 class LayerScale(nn.Module):
     """Learned factor per channel."""
 
@@ -154,7 +142,7 @@ class Block(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "v n c"]) -> Float[Array, "v n c"]:
         norm = lambda name: layer_norm(name, epsilon=1e-6)  # noqa: E731
-        x = x + LayerScale(name="ls1")(Attention(self.heads, name="attn")(norm("norm1")(x)))
+        x = x + LayerScale(name="ls1")(SelfAttention(self.heads, name="attn")(norm("norm1")(x)))
         return x + LayerScale(name="ls2")(Mlp(name="mlp")(norm("norm2")(x)))
 
 
