@@ -265,7 +265,7 @@ class StreamSplat:
         return jnp.repeat(mask, self.config.head.gaussians_per_token)
 
 
-MIN_SHARE = 1 / 64
+MIN_SHARE = 1 / 128
 """Least members of a pivot over the weight of the views that saw it, to be shown beside a larger one of its voxel."""
 
 
