@@ -148,7 +148,7 @@ def test_the_head_is_asked_only_what_it_learned():
 def test_a_pivot_that_views_outgrew_gives_way_to_the_largest_of_its_voxel():
     rng, cache = np.random.default_rng(6), init_cache(CONFIG)
     numbers = lambda *more: rng.integers(0, 5, (CONFIG.memory.capacity, *more)).astype(np.int32)  # noqa: E731
-    observations = (32 * numbers(4, NUM_OBSERVED)).astype(np.float32)
+    observations = (64 * numbers(4, NUM_OBSERVED)).astype(np.float32)
     counts, members, confidences = numbers(), numbers(4) + 1, rng.choice([0.2, 0.5], (CONFIG.memory.capacity, 4))
     facts = {"counts": counts, "num_members": members, "confidences": confidences, "observations": observations}
     cache = replace(cache, **{name: jnp.asarray(x, getattr(cache, name).dtype) for name, x in facts.items()})
@@ -157,7 +157,7 @@ def test_a_pivot_that_views_outgrew_gives_way_to_the_largest_of_its_voxel():
         left = [i for i in range(count) if confidences[row, i] >= CONFIG.memory.min_confidence]
         largest = max(left, key=lambda i: members[row, i], default=None)  # the first of equals
         for i in left:
-            wanted[row, i] = i == largest or 64 * members[row, i] >= observations[row, i, :3].sum()
+            wanted[row, i] = i == largest or 128 * members[row, i] >= observations[row, i, :3].sum()
     np.testing.assert_array_equal(jax.jit(shown_pivots, static_argnums=1)(cache, CONFIG), wanted)
     plain = CONFIG.replace(vacc="append")
     np.testing.assert_array_equal(shown_pivots(cache, plain), cache.alive & (confidences >= 0.3))
