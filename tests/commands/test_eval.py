@@ -49,10 +49,10 @@ def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow, 
 def test_a_scene_without_memory_is_a_row_and_the_others_are_scored(tmp_path, monkeypatch, capsys):
     def evaluate(session, capture, split, out, reporter, **_):
         if capture.name == "a":
-            raise RuntimeError("RESOURCE_EXHAUSTED: 9 GiB")
+            raise RuntimeError(cause)
         return {"literal": one, "shown": one, "target_views": 2, "peak_memory_bytes": 7}
 
-    one, out = {"psnr": 9.0, "ssim": 0.5, "lpips": None}, tmp_path / "out"
+    one, out, cause = {"psnr": 9.0, "ssim": 0.5, "lpips": None}, tmp_path / "out", "RESOURCE_EXHAUSTED: 9 GiB"
     monkeypatch.setattr(evaluate_run, "evaluate", evaluate)
     monkeypatch.setattr(evaluate_run, "report_eval", lambda *_: None)
     for name in ("a", "b"):
@@ -62,6 +62,9 @@ def test_a_scene_without_memory_is_a_row_and_the_others_are_scored(tmp_path, mon
     assert metrics["scenes"]["a"]["peak_memory_bytes"] == metrics["peak_memory_bytes"] == "OOM"
     assert metrics["scenes"]["b"]["literal"] == one and metrics["over_scenes"] is metrics["over_views"] is None
     assert "out of memory" in words
+    cause = "a mistake of ours"
+    with pytest.raises(RuntimeError, match=cause):
+        run("eval", str(tmp_path / "scenes"), "--context", "8", "--out", str(tmp_path / "again"))
 
 
 def test_a_folder_of_scenes_without_an_index_gets_one_by_the_protocol(tmp_path):

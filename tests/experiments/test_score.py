@@ -9,6 +9,7 @@ from PIL import Image
 from ssplat_experiments.score import run
 
 from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from tests.commands.command_fixture import make_capture
@@ -39,6 +40,12 @@ def test_renders_are_scored_as_they_are(tmp_path):
     by_place = json.loads((tmp_path / "again" / "table.json").read_text())[0]
     theirs, copy, flat = json.loads((tmp_path / "out" / "table.json").read_text())
     assert by_place["literal_psnr"] == theirs["literal_psnr"]
+    wrong = tmp_path / "by_place"
+    for names in ({"1": "3", "2": "7"}, {"0": "1", "3": "01", "7": "3"}):  # no image of target 1; two of it
+        for old, new in names.items():
+            (wrong / f"{old}.png").rename(wrong / f"{new}.png")
+        with pytest.raises(InputError, match="target 1,"):
+            run(Path(ROOM), tmp_path / "third", "smoke", QUIET, renders=wrong)
     errors = [np.mean((0.1 * room.image(i).astype(np.float64)) ** 2) for i in split.targets]
     assert abs(theirs["literal_psnr"] - np.mean(-10 * np.log10(errors))) < 0.02
     assert theirs["config"] is None and theirs["split"] == split.sha256[:12]
