@@ -234,6 +234,8 @@ def test_capacities_that_are_too_small_grow(monkeypatch):
     progress = module.Progress(first_state(), key_views(), CONFIG, max_pairs=1, max_rows=3)
     first = views_of_step(jnp.int32(0), key_views().valid, CONFIG)
     num_seen = int(jnp.sum(steps.seen_rows(doubtful(), key_views(), first)))
+    back = key_views().viewmats.at[first[1]].multiply(jnp.array([-1.0, 1, -1, 1])[:, None])  # the second looks away
+    assert num_seen == jnp.sum(steps.seen_rows(doubtful(), replace(key_views(), viewmats=back), first))
     next(progress.steps(3))
     assert progress.max_rows >= num_seen > 3 and progress.max_pairs > 1
 
